@@ -7,15 +7,13 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.example_robots import planar_arm
+from helpers.panda import LEFT, PANDA, RIGHT
 from helpers.refusals import refuses
 from robotdiffuse.baselines import controls, straight_line
 from robotdiffuse.baselines.straight_line import StraightLine, StraightLineSettings
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.exported_model import exported_model
 
-PANDA = rd.load_robot("panda")
-START = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
-GOAL = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 WALL = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.4], name="wall")])
 
 
@@ -25,7 +23,7 @@ WALL = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.4], name="wall")])
     ids=[controls.NOISE, controls.VIAS],
 )
 def test_a_wall_that_blocks_the_line_is_passed_by_candidates(settings: controls.ControlSettings) -> None:
-    found = controls.Control(settings).plan(rd.Problem(PANDA, WALL, START, rd.JointGoal([GOAL])), 20.0)
+    found = controls.Control(settings).plan(rd.Problem(PANDA, WALL, LEFT, rd.JointGoal([RIGHT])), 20.0)
     assert found.solved and found.stage == settings.source
 
 
@@ -35,8 +33,8 @@ def test_vias_are_free_and_on_the_candidates() -> None:
     checker = CollisionChecker(PANDA, rd.Scene())
     assert checker.free(vias).all()
     control = controls.Control(controls.ControlSettings(source=controls.VIAS, samples=3, guidance_steps=0))
-    q = control.candidates(START, GOAL[None], checker, np.random.default_rng(0))
-    assert (q[:, 0] == START).all() and (q[:, -1] == GOAL).all()
+    q = control.candidates(LEFT, RIGHT[None], checker, np.random.default_rng(0))
+    assert (q[:, 0] == LEFT).all() and (q[:, -1] == RIGHT).all()
     np.testing.assert_array_equal(q[:, q.shape[1] // 2], vias[:3])
     refuses("only the panda", controls.fixed_vias, planar_arm(0.5, 0.4))
 
@@ -49,10 +47,10 @@ def test_the_nearest_motions_are_bent_to_start_and_goal(monkeypatch: pytest.Monk
     # backwards, by half of each difference
     np.testing.assert_allclose(first, np.stack([start, [1.5, 0.55], goal]))
     np.testing.assert_allclose(second[[0, -1]], [start, goal])
-    monkeypatch.setattr(controls, "library", lambda data, robot: np.stack([[START, GOAL]] * 2))
+    monkeypatch.setattr(controls, "library", lambda data, robot: np.stack([[LEFT, RIGHT]] * 2))
     control = controls.Control(controls.ControlSettings(source=controls.NEAREST, data="data", samples=1, guidance_steps=0))
-    q = control.candidates(START, GOAL[None], CollisionChecker(PANDA, WALL), np.random.default_rng(0))
-    np.testing.assert_allclose(q, [[START, GOAL]])
+    q = control.candidates(LEFT, RIGHT[None], CollisionChecker(PANDA, WALL), np.random.default_rng(0))
+    np.testing.assert_allclose(q, [[LEFT, RIGHT]])
 
 
 def test_data_are_for_the_nearest_motions_alone(tmp_path: Path) -> None:
@@ -81,11 +79,11 @@ def test_smooth_noise_has_the_covariance_of_the_pandas_weights_and_keeps_ends_an
 
 
 def test_any_goal_is_tried_where_the_nearest_is_blocked() -> None:
-    free = np.append(2.8, GOAL[1:])
-    problem = rd.Problem(PANDA, WALL, START, rd.JointGoal([GOAL, free]))
+    free = np.append(2.8, RIGHT[1:])
+    problem = rd.Problem(PANDA, WALL, LEFT, rd.JointGoal([RIGHT, free]))
     found = StraightLine().plan(problem, 5.0)
     assert found.solved
-    np.testing.assert_array_equal(found.path.positions, [START, free])
+    np.testing.assert_array_equal(found.path.positions, [LEFT, free])
     alone = StraightLine(StraightLineSettings(goals=straight_line.NEAREST)).plan(problem, 5.0)
     assert not alone.solved and alone.refused == "scene_collision"
     assert "the straight line is refused" in alone.reason

@@ -9,9 +9,10 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 from torch import Tensor
 
+from helpers.panda import LEFT, PANDA, RIGHT
 from helpers.refusals import refuses
 from helpers.trainings import trained
-from robotdiffuse import JointGoal, Problem, Scene, Sphere, Status, load_robot
+from robotdiffuse import JointGoal, Problem, Scene, Sphere, Status
 from robotdiffuse.baselines import guided_prior
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.deadline import OutOfTimeError, deadline
@@ -25,10 +26,7 @@ from robotdiffuse.learning.training.tasks import PlannerLoss, model_settings, pl
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
-PANDA = load_robot("panda")
 RANGES = RobotIdentity.of(PANDA)
-LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
-RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 BALL = Sphere([0.5, 0.0, 0.4], 0.15, name="ball")
 PROBLEM = Problem(PANDA, Scene([BALL]), LEFT, JointGoal(RIGHT[None]))
 CHECKER = CollisionChecker(PANDA, PROBLEM.scene)

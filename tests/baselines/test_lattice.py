@@ -9,6 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from helpers.box_arm import box_arm
+from helpers.panda import LEFT, PANDA, RIGHT
 from robotdiffuse import Box, InputError, JointGoal, Problem, Scene, Sphere, Status, load_robot
 from robotdiffuse.baselines.lattice import AStar, AStarSettings, DStarLite, DStarLiteSettings, LatticeSearch, Outcome
 from robotdiffuse.collision import CollisionChecker
@@ -16,9 +17,6 @@ from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
 
 ARM = box_arm()
-PANDA = load_robot("panda")
-LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
-RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 WALL = Scene([Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8], name="wall")])
 AROUND = Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None]))
 SPACING = 0.35

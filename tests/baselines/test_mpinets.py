@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.panda import LEFT, PANDA, RIGHT
 from helpers.trainings import trained
-from robotdiffuse import Box, InputError, Problem, Scene, Sphere, Status, load_robot
+from robotdiffuse import Box, InputError, Problem, Scene, Sphere, Status
 from robotdiffuse.baselines.mpinets import MPiNets, MPiNetsSettings
 from robotdiffuse.learning import mpinets
 from robotdiffuse.learning.checkpoint import save_network
@@ -15,10 +16,7 @@ from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.scenes.scene_arrays import BOX, PackedScenes
 
-PANDA = load_robot("panda")
 RANGES = RobotIdentity.of(PANDA)
-LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
-RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 WALL = [0.45, 0.0, 0.25, 0.3, 0.05, 0.5, 1.0, 0.0, 0.0, 0.0]
 SMALL = mpinets.MPiNetsNetworkSettings(
     scene_points=48, robot_points=4, target_points=2, centers=(24, 8), neighbors=(6, 4),

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.panda import LEFT, PANDA, RIGHT
 from helpers.trainings import trained
-from robotdiffuse import Box, InputError, JointGoal, Problem, Scene, load_robot, verify
+from robotdiffuse import Box, InputError, JointGoal, Problem, Scene, verify
 from robotdiffuse.baselines.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.datasets.rows import resample
@@ -20,9 +21,6 @@ from robotdiffuse.planning.learned import scene_clouds
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
-PANDA = load_robot("panda")
-LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
-RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 UP = np.array([0.0, -0.9, 0.0, -1.9, 0.0, 2.2, 0.785])
 WALL = Scene([Box([0.5, 0.0, 0.2], [0.3, 0.05, 0.4], name="wall")])
 SMALL = MPNetSettings(points=40, encoder_layers=(32, 16), code=8, decoder_layer=16, layers=(64, 64, 32), steady_layers=1)

@@ -12,13 +12,11 @@ pytest.importorskip("ompl")
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
+from helpers.panda import LEFT, PANDA, RIGHT
 from helpers.refusals import refuses
 from robotdiffuse.baselines import ompl
 from robotdiffuse.collision import CollisionChecker
 
-PANDA = rd.load_robot("panda")
-LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
-RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 WALL = rd.Scene([rd.Box([0.45, 0.0, 0.25], [0.3, 0.05, 0.5], name="wall")])
 FIRST = (ompl.OmplRRT, ompl.OmplRRTConnect, ompl.OmplPRM)
 ANYTIME = (ompl.OmplRRTStar, ompl.OmplInformedRRTStar, ompl.OmplBITStar, ompl.OmplAORRTC)

@@ -9,10 +9,10 @@ import pytest
 import trimesh
 
 import robotdiffuse as rd
+from helpers.boxes import boxes, surface
 from helpers.example_robots import planar_arm
 from helpers.refusals import refuses
 from robotdiffuse.collision.exact_meshes import ExactCollision, explain_collision
-from robotdiffuse.robots.bodies import Surface
 from robotdiffuse.robots.fitting.convex_parts import convex_hull
 from robotdiffuse.robots.fitting.covering_spheres import cover
 from robotdiffuse.robots.robot_folder import SURFACE_FILE, read_robot_folder, write_robot_folder
@@ -25,22 +25,11 @@ LIP = 0.003
 EMPTY = rd.Scene(())
 
 
-def boxes(*ends: tuple[tuple[float, ...], tuple[float, ...]]) -> Surface:
-    """Closed boxes from their lowest to their highest corners; boxes share no vertices."""
-    vertices = []
-    faces = []
-    for low, high in ends:
-        box = trimesh.creation.box(bounds=np.array([low, high]))
-        faces.append(np.array(box.faces) + 8 * len(vertices))
-        vertices.append(np.array(box.vertices))
-    return Surface(np.concatenate(vertices), np.concatenate(faces))
-
-
-def arm(wall: Surface, link: Surface, grazing: bool = True) -> rd.Robot:
+def arm(wall: trimesh.Trimesh, link: trimesh.Trimesh, grazing: bool = True) -> rd.Robot:
     """Two joints about z, 0.5 m apart; the wall is fixed to the base. One convex part per link."""
     robot = planar_arm(0.5, 0.3)
-    surfaces = {"l0": wall, "l2": link}
-    meshes = {name: (convex_hull(surface.vertices),) for name, surface in surfaces.items()}
+    surfaces = {"l0": surface(wall), "l2": surface(link)}
+    meshes = {name: (convex_hull(of.vertices),) for name, of in surfaces.items()}
     limits = {"lower": -2.8, "upper": 2.8, "velocity": 2.0, "acceleration": 8.0, "jerk": 80.0}
     return replace(
         robot,
@@ -140,9 +129,9 @@ def test_folders_keep_the_surfaces_and_refuse_those_of_other_meshes(tmp_path: Pa
     write_robot_folder(channel(), tmp_path, {})
     kept = read_robot_folder(tmp_path)
     assert kept.grazing == channel().grazing
-    for link, surface in channel().surfaces.items():
-        np.testing.assert_allclose(kept.surfaces[link].vertices, surface.vertices, atol=1e-7)
-        np.testing.assert_array_equal(kept.surfaces[link].faces, surface.faces)
+    for link, written in channel().surfaces.items():
+        np.testing.assert_allclose(kept.surfaces[link].vertices, written.vertices, atol=1e-7)
+        np.testing.assert_array_equal(kept.surfaces[link].faces, written.faces)
     packed = (tmp_path / SURFACE_FILE).read_bytes()
     write_robot_folder(channel(False), tmp_path, {})
     assert not (tmp_path / SURFACE_FILE).exists() and not read_robot_folder(tmp_path).grazing
@@ -164,8 +153,8 @@ def test_baxters_torso_and_arms_graze_as_trimesh_finds_too() -> None:
     meshes = []
     for each in links:
         T = robot.fk(q, each)
-        surface = robot.surfaces[each]
-        meshes.append(trimesh.Trimesh(surface.vertices @ T[:3, :3].T + T[:3, 3], surface.faces, process=False))
+        of = robot.surfaces[each]
+        meshes.append(trimesh.Trimesh(of.vertices @ T[:3, :3].T + T[:3, 3], of.faces, process=False))
     nearest = []
     for one, other in (meshes, meshes[::-1]):
         points = np.concatenate([one.vertices, trimesh.sample.sample_surface(one, 3000, seed=0)[0]])

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import robotdiffuse as rd
+from helpers.panda import HOME, PANDA
 from helpers.refusals import refuses
 from helpers.trainings import trained
 from robotdiffuse.learning.checkpoint import load_completion, save_network
@@ -32,8 +33,6 @@ from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_with
 from robotdiffuse.perception.voxel_grid import FINE, SHAPE, refined
 from robotdiffuse.problems.families import FAMILIES, load_family
 
-PANDA = rd.load_robot("panda")
-HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 SMALL = CompletionSettings(channels=(8, 8, 8), blocks=(1, 1, 1))
 TINY = completion.CompletionTraining(samples=8, batch=2, workers=0, network=SMALL, families=("rop", "table"))
 

@@ -5,22 +5,21 @@ import pytest
 from numba import njit
 
 from helpers.clock import stop_clock
+from helpers.panda import HOME
 from robotdiffuse import Problem, Scene, Sphere, Status, load_planner, load_robot
 from robotdiffuse.core.deadline import TIMING, OutOfTimeError
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 
-START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
-
 
 def turned(angle: float) -> np.ndarray:
-    return START + np.array([angle, 0, 0, 0, 0, 0, 0])
+    return HOME + np.array([angle, 0, 0, 0, 0, 0, 0])
 
 
 BLOCKED = Scene([Sphere((0.4, 0.3, 0.6), 0.15)])
 
 
 def context_for(scene: Scene, time_limit: float = 10.0) -> PlanningContext:
-    problem = Problem(load_robot("panda"), scene, START, turned(1.2))
+    problem = Problem(load_robot("panda"), scene, HOME, turned(1.2))
     return PlanningContext("test", problem, PlanRequest(time_limit=time_limit))
 
 
@@ -30,7 +29,7 @@ def test_progress_falls_and_ends_with_the_returned_path_when_it_was_found() -> N
         context = context_for(Scene([]))
         for length in found:
             context.improved(length)
-        result = context.finish(np.stack([START, turned(1.2)]), "test")
+        result = context.finish(np.stack([HOME, turned(1.2)]), "test")
         assert result is not None
         np.testing.assert_allclose([length for _, length in result.progress], kept)
         assert result.progress[-1][1] == result.path.length
@@ -41,7 +40,7 @@ def test_failures_name_what_the_validator_refused_and_what_ended_the_search() ->
     context = context_for(BLOCKED)
     for angle, refused in ((None, ""), (1.2, "scene_collision"), (0.1, "goal")):
         if angle is not None:
-            assert context.finish(np.stack([START, turned(angle)]), "test") is None
+            assert context.finish(np.stack([HOME, turned(angle)]), "test") is None
         ended = context.unsolved()
         assert ended.refused == refused
         assert ended.status is Status.NO_PATH and "the search ended" in ended.reason

@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial import KDTree
 
 import robotdiffuse as rd
-from helpers.explorations import FLOOR, HOME, WALL, ZONE, recorded
+from helpers.explorations import FLOOR, WALL, ZONE, recorded
+from helpers.panda import HOME, PANDA
 from helpers.refusals import refuses
 from robotdiffuse.perception.occupancy_map import OccupancyMap, ViewMemory
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
@@ -25,7 +26,6 @@ from robotdiffuse.planning.exploration.stopping import braked
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.trajectories.speed_limits import jerk_limits
 
-PANDA = rd.load_robot("panda")
 LEFT, RIGHT = (np.array([turn, *HOME[1:]]) for turn in (0.5, -1.7))
 OUTSIDE = np.array([-1.7, 0.3, 0.0, -1.8, 0.0, 2.0, 0.785])
 PROBLEM = rd.Problem(PANDA, rd.Scene([FLOOR, WALL]), LEFT, RIGHT)

@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.panda import LEFT, PANDA, RIGHT
 from helpers.refusals import refuses
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.planning import PLANNERS, SEARCH
 
-PANDA = rd.load_robot("panda")
-LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
-RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 BURIED = rd.Scene([rd.Sphere([0.0, 0.0, 0.3], 0.5, name="everything")])
 
 

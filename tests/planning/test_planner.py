@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.panda import HOME, LEFT, PANDA, RIGHT
 from helpers.refusals import refuses
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, SEARCH
 from robotdiffuse.planning.context import PlanRequest
@@ -16,8 +17,7 @@ from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.problems.held_out import held_out_problem
 
-START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
-GOAL = START + np.array([1.2, 0.3, 0.0, 0.4, 0.0, 0.0, 0.0])
+GOAL = HOME + np.array([1.2, 0.3, 0.0, 0.4, 0.0, 0.0, 0.0])
 OTHER_ARGUMENTS = ("self", "problem", "planner", "settings")
 """Arguments of `plan` that are not of the request."""
 
@@ -45,7 +45,7 @@ def test_solved_means_verified(name: str, number: int) -> None:
 
 
 def test_a_goal_in_collision_is_reported_and_time_limit_and_seed_are_checked(name: str) -> None:
-    problem = rd.Problem(rd.load_robot("panda"), rd.Scene([rd.Sphere((0.2, 0.5, 0.5), 0.3)]), START, GOAL)
+    problem = rd.Problem(PANDA, rd.Scene([rd.Sphere((0.2, 0.5, 0.5), 0.3)]), HOME, GOAL)
     planner = rd.load_planner(name)
     result = planner.plan(problem, time_limit=30.0)
     assert result.status is rd.Status.INVALID_GOAL and "in collision" in result.reason
@@ -56,7 +56,7 @@ def test_a_goal_in_collision_is_reported_and_time_limit_and_seed_are_checked(nam
 def test_weights_are_for_learned_planners_alone(name: str) -> None:
     learned = PLANNERS[name].kind != SEARCH
     with pytest.raises(rd.InputError, match="nowhere" if learned else "has no weights"):
-        rd.load_planner(name, weights="nowhere").plan(rd.Problem(rd.load_robot("panda"), rd.Scene([]), START, GOAL))
+        rd.load_planner(name, weights="nowhere").plan(rd.Problem(PANDA, rd.Scene([]), HOME, GOAL))
 
 
 def test_plan_takes_the_fields_of_a_request() -> None:
@@ -67,7 +67,7 @@ def test_plan_takes_the_fields_of_a_request() -> None:
 
 
 def test_plan_with_a_planner_and_settings_by_name() -> None:
-    problem = rd.Problem(rd.load_robot("panda"), rd.Scene(), START, GOAL)
+    problem = rd.Problem(PANDA, rd.Scene(), HOME, GOAL)
     first = rd.plan(problem, planner="aorrtc", settings={"range": 0.5, "keep_trees": True})
     assert first.solved and first.planner == "aorrtc"
     nested = rd.load_planner("diffusion", {"guidance": {"margin": 0.03}, "guidance.self_margin": 0.02})
@@ -81,10 +81,9 @@ def test_plan_with_a_planner_and_settings_by_name() -> None:
 
 
 def test_the_default_planner_is_aorrtc_and_needs_no_weights() -> None:
-    panda = replace(rd.load_robot("panda"), name="stranger")
+    panda = replace(PANDA, name="stranger")
     ball = rd.Scene([rd.Sphere([0.5, 0.0, 0.4], 0.15, name="ball")])
-    left = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
-    problem = rd.Problem(panda, ball, left, left * [-1, 1, 1, 1, 1, 1, 1])
+    problem = rd.Problem(panda, ball, LEFT, RIGHT)
     names = (DEFAULT_PLANNER, "aorrtc")
     first, second = (rd.load_planner(name).plan(problem, 60.0, seed=3) for name in names)
     assert np.array_equal(first.path.positions, second.path.positions)
@@ -94,7 +93,7 @@ def test_the_default_planner_is_aorrtc_and_needs_no_weights() -> None:
 def test_warming_up_loads_what_a_plan_needs_by_default() -> None:
     # it ended at first paths, and the first plan then compiled the search for the fastest motion (10 s)
     assert inspect.signature(Planner.warm_up).parameters["until"].default == PlanRequest().until
-    problem = rd.Problem(rd.load_robot("panda"), rd.Scene([]), START, GOAL)
+    problem = rd.Problem(PANDA, rd.Scene([]), HOME, GOAL)
     results = rd.load_planner("aorrtc").warm_up(problem)
     rows = [len(result.path.positions) for result in results if result.path]
     assert rows[0] == 2 and max(rows) > 2, "balls in the way make corners"
@@ -113,6 +112,5 @@ def test_at_most_nine_functions_lead_to_the_search(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(rrt_kernel, "search", measured)
     wall = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8])])
-    side = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
-    assert rd.plan(rd.Problem(rd.load_robot("panda"), wall, side, side * [-1, 1, 1, 1, 1, 1, 1])).solved
+    assert rd.plan(rd.Problem(PANDA, wall, LEFT, RIGHT)).solved
     assert depths and max(depths) <= 9

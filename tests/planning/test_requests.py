@@ -10,22 +10,21 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.panda import HOME, PANDA
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS, PLANNERS, planners_that_support
 
-PANDA = rd.load_robot("panda")
-START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
-GOAL = START + np.array([0.4, 0.1, 0.0, 0.1, 0.0, 0.0, 0.1])
+GOAL = HOME + np.array([0.4, 0.1, 0.0, 0.1, 0.0, 0.0, 0.1])
 HAND = "panda_hand"
 ELBOW = "panda_link4"
 SCENE = rd.Scene([rd.Box([0.0, -0.8, 0.3], [0.2, 0.2, 0.6], name="crate")])
 T_WORLD_BASE = transform(np.array([1.0, -2.0, 0.5]), rotation_about(np.array([0.0, 0.0, 1.0]), 2.0))
-MIDDLE = (START + GOAL) / 2
+MIDDLE = (HOME + GOAL) / 2
 POSE = rd.PoseGoal(HAND, PANDA.fk(GOAL, HAND))
 ROOMY = rd.PoseGoal(HAND, POSE.T_base_frame, [0.02] * 3, [0.1, 0.1, np.pi])
 AT = POSE.T_base_frame[:3, 3]
-WAY = AT - PANDA.fk(START, HAND)[:3, 3]
+WAY = AT - PANDA.fk(HOME, HAND)[:3, 3]
 CONE = rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.2)
 HELD_CONE = rd.AxisCone("parcel", [0, 0, 1], [0, 0, -1], 0.2).moved(T_WORLD_BASE)
 PASSING = rd.MovingObstacle(rd.Sphere([0.9, -0.6, 0.5], 0.1, name="ball"), velocity=[0.0, 0.8, 0.0])
@@ -36,7 +35,7 @@ ASKED: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "poses of two links": ({"goal": rd.PosesGoal([rd.PoseGoal(ELBOW, PANDA.fk(GOAL, ELBOW)), POSE])}, {}),
     "any goal": ({"goal": [POSE, rd.JointGoal(GOAL)]}, {}),
     "waypoints": ({"waypoints": [MIDDLE]}, {}),
-    "blended": ({"waypoints": [MIDDLE + 0.1, POSE], "goal": START, "blend": 0.05}, {}),
+    "blended": ({"waypoints": [MIDDLE + 0.1, POSE], "goal": HOME, "blend": 0.05}, {}),
     "base": ({"base": True}, {}),
     "tool and attached": ({"held": True}, {}),
     "views": ({"seen": True}, {}),
@@ -73,12 +72,12 @@ def problem_of(asked: str) -> rd.Problem:
         robot = robot.attach(rd.Box([0, 0, 0.04], [0.06] * 3, name="parcel"), "tool")
     if fields.pop("seen", False):
         T = looking_at(np.array([1.7, 0.0, 0.3]), np.array([0.0, 0.0, 0.3]))
-        view = ray_cast(SCENE, T, (75.0, 75.0, 39.5, 29.5), (80, 60), PANDA, START)
+        view = ray_cast(SCENE, T, (75.0, 75.0, 39.5, 29.5), (80, 60), PANDA, HOME)
         scene = rd.Scene()
         fields |= {"views": [view], "unknown": "padded"}
     if fields.pop("base", False):
-        return rd.Problem.in_world(T_WORLD_BASE, robot, scene.moved(T_WORLD_BASE), START, goal, **fields)
-    return rd.Problem(robot, scene, START, goal, **fields)
+        return rd.Problem.in_world(T_WORLD_BASE, robot, scene.moved(T_WORLD_BASE), HOME, goal, **fields)
+    return rd.Problem(robot, scene, HOME, goal, **fields)
 
 
 THROUGH = ("robotdiffuse", "rrt_connect")

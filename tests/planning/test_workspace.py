@@ -6,30 +6,28 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.panda import GOAL, HOME, PANDA, START
 from helpers.refusals import refuses
 
-READY = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
-LEFT = np.array([-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
-RIGHT = LEFT * [-1, 1, 1, 1, 1, 1, 1]
 T_WORLD_BASE = rd.pose([0.3, -0.2, 0.7], rpy=[0.0, 0.0, 0.5])
 
 
 def panda(**options: object) -> rd.Workspace:
-    return rd.Workspace(rd.load_robot("panda"), **options)  # type: ignore[arg-type]
+    return rd.Workspace(PANDA, **options)  # type: ignore[arg-type]
 
 
 def test_motions_are_for_the_obstacles_as_they_are_then() -> None:
     space = panda()
-    free = space.plan(RIGHT, LEFT, time_limit=10.0)
+    free = space.plan(GOAL, START, time_limit=10.0)
     assert free.stage == "straight_line"
     table = rd.Box([0.5, 0.0, -0.2], [1.0, 1.0, 0.1], name="table")
     space.add(rd.Sphere([0.5, 0.0, 0.6], 0.2, name="ball"), table)
     assert space.obstacles == ("ball", "table")
-    around = space.plan(RIGHT, LEFT, time_limit=10.0)
+    around = space.plan(GOAL, START, time_limit=10.0)
     assert around.solved and around.path_length > free.path_length + 0.1
-    assert rd.verify(rd.Problem(space.robot, space.scene, LEFT, RIGHT), around.trajectory).valid
+    assert rd.verify(rd.Problem(space.robot, space.scene, START, GOAL), around.trajectory).valid
     space.move("ball", rd.pose([0.5, 0.0, 3.0]))
-    assert space.plan(RIGHT, LEFT, time_limit=10.0).stage == "straight_line"
+    assert space.plan(GOAL, START, time_limit=10.0).stage == "straight_line"
     space.add(rd.Sphere([0.5, 0.0, 0.6], 0.1, name="ball"))  # in place of the first
     assert space.obstacles == ("table", "ball")
     space.remove("ball")
@@ -42,14 +40,14 @@ def test_poses_are_in_the_world() -> None:
     """The same scene and goal relative to a base that stands elsewhere give the same motion."""
     here, there = panda(), panda(T_world_base=T_WORLD_BASE)
     ball = rd.Sphere([0.5, 0.0, 0.6], 0.2, name="ball")
-    pose = here.pose(RIGHT)
-    assert np.allclose(there.pose(RIGHT), T_WORLD_BASE @ pose)
+    pose = here.pose(GOAL)
+    assert np.allclose(there.pose(GOAL), T_WORLD_BASE @ pose)
     here.add(ball)
     there.add(ball.moved(T_WORLD_BASE))
-    assert np.allclose(there.clearance(LEFT), here.clearance(LEFT))
-    assert np.allclose(there.ik(T_WORLD_BASE @ pose, near=RIGHT)[0], RIGHT, atol=1e-3)
+    assert np.allclose(there.clearance(START), here.clearance(START))
+    assert np.allclose(there.ik(T_WORLD_BASE @ pose, near=GOAL)[0], GOAL, atol=1e-3)
     one, other = (
-        space.plan(goal, LEFT, time_limit=10.0, planner="aorrtc", until="first")
+        space.plan(goal, START, time_limit=10.0, planner="aorrtc", until="first")
         for space, goal in ((here, pose), (there, T_WORLD_BASE @ pose))
     )
     assert np.allclose(one.path.positions[-1], other.path.positions[-1], atol=1e-4)
@@ -59,74 +57,74 @@ def test_poses_are_in_the_world() -> None:
 
 def test_the_nearest_goal_that_a_line_leads_to() -> None:
     space = panda(T_world_base=T_WORLD_BASE)
-    T = space.robot.fk(READY, space.tip)
+    T = space.robot.fk(HOME, space.tip)
     offsets = [[0.0, 0.0, 0.12], [0.0, 0.0, 0.06], [0.05, 0.0, 0.0], [0.0, 0.0, -2.0]]
     goal = rd.AnyGoal(tuple(rd.PoseGoal(space.tip, T @ rd.pose(xyz)) for xyz in offsets))
     line = rd.CartesianLine(space.tip, 0.001, 0.05)
 
     def check(index: int) -> None:
-        result = space.plan_line(goal, READY, time_limit=40.0)
+        result = space.plan_line(goal, HOME, time_limit=40.0)
         assert result.solved and result.goal_index == index and result.fraction == 1.0, result.reason
-        problem = rd.Problem(space.robot, space.scene, READY, goal.goals[index], constraints=[line])
+        problem = rd.Problem(space.robot, space.scene, HOME, goal.goals[index], constraints=[line])
         assert rd.verify(problem, result.trajectory).valid
 
     check(2)
     goal = rd.AnyGoal((goal.goals[0], goal.goals[1]))
     check(1)
     goal = rd.AnyGoal((rd.PoseGoal(space.tip, T @ rd.pose([0.0, 0.0, -2.0])),))
-    result = space.plan_line(goal, READY, time_limit=4.0)
+    result = space.plan_line(goal, HOME, time_limit=4.0)
     assert not result.solved and result.reason.startswith("goal 0: ")
 
 
 def test_a_limit_that_has_run_out_before_the_line_is_planned() -> None:
     """Regression: the error was "time_limit is -0.00085"."""
     space = panda(T_world_base=T_WORLD_BASE)
-    end = space.pose(READY) @ rd.pose([0.0, 0.0, 0.05])
+    end = space.pose(HOME) @ rd.pose([0.0, 0.0, 0.05])
     for corners in ((), (end,)):
-        assert space.plan_line(end, READY, time_limit=1e-5, waypoints=corners).reason
-        refuses("time_limit is -1", space.plan_line, end, READY, time_limit=-1.0, waypoints=corners)
+        assert space.plan_line(end, HOME, time_limit=1e-5, waypoints=corners).reason
+        refuses("time_limit is -1", space.plan_line, end, HOME, time_limit=-1.0, waypoints=corners)
 
 
 def test_lines_through_waypoints_are_one_motion() -> None:
     space = panda(T_world_base=T_WORLD_BASE)
-    T = space.pose(READY)
+    T = space.pose(HOME)
     corners = [T @ rd.pose(xyz) for xyz in ([0.05, 0.0, 0.0], [0.05, 0.05, 0.0], [0.0, 0.05, 0.0])]
-    result = space.plan_line(T, READY, waypoints=corners, time_limit=20.0)
+    result = space.plan_line(T, HOME, waypoints=corners, time_limit=20.0)
     assert result.solved and result.fraction == 1.0 and result.stops == 3, result.reason
     assert rd.verify(result.problem, result.trajectory).valid
     inside = np.linalg.inv(T) @ np.array([space.pose(q) for q in result.trajectory.positions])
     x, y, z = inside[:, :3, 3].T
     off = np.minimum(np.minimum(abs(x), abs(x - 0.05)), np.minimum(abs(y), abs(y - 0.05)))
     assert off.max() < 0.001 and np.abs(z).max() < 0.001
-    far = space.plan_line(T @ rd.pose([0.0, 0.0, 2.0]), READY, waypoints=corners[:1], time_limit=4.0)
+    far = space.plan_line(T @ rd.pose([0.0, 0.0, 2.0]), HOME, waypoints=corners[:1], time_limit=4.0)
     assert not far.solved and far.reason.startswith("line 2 of 2: ") and far.fraction is not None
     assert 0.5 < far.fraction < 1.0
 
 
 def test_a_line_to_a_goal_with_tolerances_turns_no_more_than_it_must() -> None:
     space = panda()
-    T = space.pose(READY)
+    T = space.pose(HOME)
     goal = rd.PoseGoal(space.tip, T @ rd.pose([0.0, 0.05, 0.05], rpy=[0, 0, 1.0]), None, [0, 0, np.pi])
-    free = space.plan_line(goal, READY, time_limit=20.0)
+    free = space.plan_line(goal, HOME, time_limit=20.0)
     assert free.solved, free.reason
     end = np.linalg.inv(T) @ space.pose(free.path.positions[-1])
     assert np.allclose(end, rd.pose([0.0, 0.05, 0.05]), atol=1e-3)
     goal = rd.PoseGoal(space.tip, T @ rd.pose([0.0, 0.05, 0.05], rpy=[0, 0, 1.0]), [0, 0.02, 0], [0, 0, 0.2])
-    less = space.plan_line(goal, READY, time_limit=20.0)
+    less = space.plan_line(goal, HOME, time_limit=20.0)
     end = np.linalg.inv(goal.T_base_frame) @ space.pose(less.path.positions[-1])
     assert np.arctan2(end[1, 0], end[0, 0]) == pytest.approx(-0.2, abs=1e-3)
-    problem = rd.Problem(space.robot, space.scene, READY, goal)
+    problem = rd.Problem(space.robot, space.scene, HOME, goal)
     assert rd.verify(problem, less.trajectory).valid
 
 
 @pytest.mark.parametrize(("way", "turn", "angle"), [(0.0, 0.0, None), (0.0, 0.5, 0.05), (0.0, 0.5, None), (0.0005, 0.0, 0.05)])
 def test_short_lines_and_turns_about_the_tool_point(way: float, turn: float, angle: float | None) -> None:
     space = panda()
-    end = space.pose(READY) @ rd.pose([0.0, 0.0, way], rpy=[0.0, 0.0, turn])
-    result = space.plan_line(end, READY, angle=angle, time_limit=20.0)
+    end = space.pose(HOME) @ rd.pose([0.0, 0.0, way], rpy=[0.0, 0.0, turn])
+    result = space.plan_line(end, HOME, angle=angle, time_limit=20.0)
     assert result.solved and result.fraction == 1.0, result.reason
     line = rd.CartesianLine(space.tip, 0.001, angle)
-    problem = rd.Problem(space.robot, space.scene, READY, rd.PoseGoal(space.tip, end), constraints=[line])
+    problem = rd.Problem(space.robot, space.scene, HOME, rd.PoseGoal(space.tip, end), constraints=[line])
     assert rd.verify(problem, result.trajectory).valid
 
 
@@ -135,9 +133,9 @@ def test_bad_input() -> None:
         (lambda space: space.plan_line([np.eye(4)] * 2, "ready"), "pose is 2 poses; a line has one end"),
         (lambda space: space.move("bal", np.eye(4)), "unknown obstacle 'bal'; known: ball"),
         (lambda space: space.move("ball", np.eye(3)), "T_world_shape is .*; it must be 4 x 4"),
-        (lambda space: space.attach("cup", READY), "unknown obstacle 'cup'"),
+        (lambda space: space.attach("cup", HOME), "unknown obstacle 'cup'"),
         (lambda space: space.add(*[rd.Sphere([1, 0, 0], 0.1, name="a")] * 2), "names must differ"),
-        (lambda space: space.plan(READY, READY[:3]), "start has 3 values; panda has 7 planned joints"),
+        (lambda space: space.plan(HOME, HOME[:3]), "start has 3 values; panda has 7 planned joints"),
         (lambda space: rd.Workspace(space.robot, tip="nose"), "unknown link 'nose'"),
         (lambda space: space.plan_steps([rd.MoveTo("redy")], "ready"), "step 1 of 1, move to: .*'redy'"),
         (
@@ -158,16 +156,16 @@ def test_bad_input() -> None:
 
 def test_values_by_joint_are_a_configuration() -> None:
     space = panda()
-    by_joint = dict(zip(space.robot.joint_names, RIGHT.tolist(), strict=True))
+    by_joint = dict(zip(space.robot.joint_names, GOAL.tolist(), strict=True))
     problem = rd.Problem(space.robot, space.scene, by_joint | {"panda_finger_joint1": 0.01}, "ready")
-    assert np.array_equal(problem.start, RIGHT)
+    assert np.array_equal(problem.start, GOAL)
     several = rd.Problem(space.robot, space.scene, "ready", [by_joint, "extended"])
-    assert np.array_equal(several.goal.positions[0], RIGHT)  # type: ignore[union-attr]
-    assert np.array_equal(space.pose(by_joint), space.pose(RIGHT))
+    assert np.array_equal(several.goal.positions[0], GOAL)  # type: ignore[union-attr]
+    assert np.array_equal(space.pose(by_joint), space.pose(GOAL))
     assert space.is_free(by_joint)
     with pytest.raises(rd.InputError, match="start has no panda_joint7"):
-        rd.Problem(space.robot, space.scene, {k: v for k, v in by_joint.items() if k[-1] != "7"}, RIGHT)
-    refuses(r"unknown joint in goal: 'joint_1'", rd.Problem, space.robot, space.scene, RIGHT, by_joint | {"joint_1": 0.0})
+        rd.Problem(space.robot, space.scene, {k: v for k, v in by_joint.items() if k[-1] != "7"}, GOAL)
+    refuses(r"unknown joint in goal: 'joint_1'", rd.Problem, space.robot, space.scene, GOAL, by_joint | {"joint_1": 0.0})
 
 
 FINGERS = ["panda_hand", "panda_leftfinger", "panda_rightfinger"]
@@ -176,7 +174,7 @@ GRASP = rd.pose([0.5, -0.3, 0.18], rpy=DOWN)
 
 
 def table_with_can() -> rd.Workspace:
-    space = rd.Workspace(rd.load_robot("panda"), "panda_hand")
+    space = rd.Workspace(PANDA, "panda_hand")
     space.add(
         rd.Box([0.55, 0.0, -0.05], [0.8, 1.4, 0.1], name="table"),
         rd.Cylinder([0.5, -0.3, 0.06], radius=0.03, height=0.12, name="can"),

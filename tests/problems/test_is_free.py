@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.panda import HOME, PANDA
 from helpers.refusals import refuses
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.problems.units import arm_in_cloud_note, unit_notes
 from robotdiffuse.robots.kinematics import link_pose
 
-PANDA = rd.load_robot("panda")
 Q = np.array([0.0, 0.3, 0, -1.8, 0, 2.1, 0.8])
 HAND = link_pose(PANDA, Q, "panda_hand")[:3, 3]
 PROBLEM = rd.Problem(PANDA, rd.Scene([rd.Sphere(HAND, 0.05, "ball")]), "ready", "extended")
@@ -60,7 +60,6 @@ def test_the_least_distance_at_one_configuration_or_several() -> None:
     refuses(r"q is .* it must be 7 numbers", PROBLEM.clearance_at, [0.0])
 
 
-FROM = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
 TO = [0.4, -0.7, 0.0, -2.3, 0.0, 1.571, 0.785]
 
 
@@ -70,7 +69,7 @@ def seen() -> rd.DepthView:
     camera = looking_at(np.array([1.7, 0.0, 0.6]), np.array([0.4, 0.0, 0.3]))
     lens = (75.0, 75.0, 39.5, 29.5)
     box = rd.Box([0.0, -0.8, 0.3], [0.2, 0.2, 0.6])
-    return ray_cast(rd.Scene([box]), camera, lens, (80, 60), PANDA, np.array(FROM))
+    return ray_cast(rd.Scene([box]), camera, lens, (80, 60), PANDA, HOME)
 
 
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
@@ -78,7 +77,7 @@ FACES = [[0, 1, 3], [0, 3, 2], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4]]
 
 
 def _notes(*shapes: rd.Box | rd.Mesh | rd.PointCloud | rd.Sphere, **options: object) -> tuple[str, ...]:
-    return unit_notes(rd.Problem(PANDA, rd.Scene(shapes), FROM, TO, **options))  # type: ignore[arg-type]
+    return unit_notes(rd.Problem(PANDA, rd.Scene(shapes), HOME, TO, **options))  # type: ignore[arg-type]
 
 
 def test_obstacles_in_millimeters_are_noted() -> None:
@@ -104,13 +103,13 @@ def test_a_depth_image_in_millimeters_is_noted() -> None:
     wrong = [rd.DepthView(1000 * seen().depth, seen().intrinsics, seen().T_base_camera)]
     [note] = _notes(views=wrong)
     assert "depths of views[0] begin at" in note and "millimeters" in note
-    problem = rd.Problem(PANDA, rd.Scene(), FROM, TO, views=wrong, unknown="padded")
+    problem = rd.Problem(PANDA, rd.Scene(), HOME, TO, views=wrong, unknown="padded")
     assert rd.load_planner("aorrtc").plan(problem).notes.count(note) == 1
 
 
 def test_what_views_see_in_reach_is_no_scene_beyond_it() -> None:
     far = rd.Scene([rd.Sphere([0, 5, 0], 0.2)])
-    problem = rd.Problem(PANDA, far, FROM, TO, views=[seen()], unknown="padded")
+    problem = rd.Problem(PANDA, far, HOME, TO, views=[seen()], unknown="padded")
     notes = rd.load_planner("aorrtc").plan(problem).notes
     assert all(note.startswith("compiled for") for note in notes), notes
 
@@ -118,7 +117,7 @@ def test_what_views_see_in_reach_is_no_scene_beyond_it() -> None:
 def test_a_cloud_that_the_arm_stands_in_is_noted() -> None:
     points = np.random.default_rng(0).uniform(-0.5, 0.8, (3000, 3))
     scene = rd.Scene([rd.PointCloud(points, name="scan")])
-    result = rd.load_planner("aorrtc").plan(rd.Problem(PANDA, scene, FROM, TO), time_limit=60.0)
+    result = rd.load_planner("aorrtc").plan(rd.Problem(PANDA, scene, HOME, TO), time_limit=60.0)
     assert result.status is rd.Status.INVALID_START
     assert "points of scan are within the arm" in result.notes[0] and "millimeters" in result.notes[0]
-    assert arm_in_cloud_note(PANDA, rd.Scene([rd.PointCloud(CUBE + 2)]), np.array(FROM)) == ""
+    assert arm_in_cloud_note(PANDA, rd.Scene([rd.PointCloud(CUBE + 2)]), HOME) == ""

@@ -3,10 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from PIL import Image
 
-from robotdiffuse import InputError, Path, Scene
+from helpers.refusals import refuses
+from robotdiffuse import Path, Scene
 from robotdiffuse.drawables import drawables
 from robotdiffuse.visualization import PictureSettings, write_comparison, write_picture
 from robotdiffuse.visualization.arm import DrawnArm
@@ -52,5 +52,4 @@ def test_several_motions_have_traces_of_their_own_colors(arm, motion, tmp_path):
     with Image.open(tmp_path / "two.png") as image:
         assert image.size == (320, 200)
     many = {str(i): motion for i in range(len(COMPARED) + 1)}
-    with pytest.raises(InputError, match="5 motions; a picture shows 1 to 4"):
-        write_comparison(arm, Scene(), many, tmp_path / "many.png")
+    refuses("5 motions; a picture shows 1 to 4", write_comparison, arm, Scene(), many, tmp_path / "many.png")

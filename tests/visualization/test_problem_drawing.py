@@ -7,11 +7,9 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.pages import page_data
+from helpers.panda import GOAL, PANDA, START
 from robotdiffuse.visualization.replay_page import COLLIDING, write_problem
 
-PANDA = rd.load_robot("panda")
-START = np.array([-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8])
-END = START * [-1, 1, 1, 1, 1, 1, 1]
 AT_START = rd.Sphere(PANDA.fk(START, "panda_hand")[:3, 3], 0.05, "ball")
 FAR = np.eye(4)
 FAR[0, 3] = 1.5
@@ -27,12 +25,12 @@ def marks(data: dict, color: tuple[int, int, int]) -> list[dict]:
 
 
 def test_links_that_collide_are_red(tmp_path: Path) -> None:
-    problem = rd.Problem(PANDA, rd.Scene([AT_START]), START, END)
+    problem = rd.Problem(PANDA, rd.Scene([AT_START]), START, GOAL)
     data = page(problem, tmp_path / "a.html")
     assert len(marks(data, COLLIDING)) == len(problem.is_free(START).links) > 0
-    assert data["positions"] == [START.tolist(), END.tolist()] and data["times"] == [0.0, 0.0]
+    assert data["positions"] == [START.tolist(), GOAL.tolist()] and data["times"] == [0.0, 0.0]
     assert dict(data["facts"])["start"].endswith("inside ball") and dict(data["facts"])["goal"] == "free"
-    assert not marks(page(rd.Problem(PANDA, rd.Scene(), START, END), tmp_path / "b.html"), COLLIDING)
+    assert not marks(page(rd.Problem(PANDA, rd.Scene(), START, GOAL), tmp_path / "b.html"), COLLIDING)
 
 
 @pytest.mark.parametrize("moved", [False, True])
@@ -48,5 +46,5 @@ def test_a_goal_out_of_reach_has_axes(moved: bool, tmp_path: Path) -> None:
 
 
 def test_of_several_goals_a_free_one_is_drawn(tmp_path: Path) -> None:
-    problem = rd.Problem(PANDA, rd.Scene([AT_START]), END, [START, END])
-    assert page(problem, tmp_path / "a.html")["positions"][1] == END.tolist()
+    problem = rd.Problem(PANDA, rd.Scene([AT_START]), GOAL, [START, GOAL])
+    assert page(problem, tmp_path / "a.html")["positions"][1] == GOAL.tolist()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.panda import LEFT, PANDA, RIGHT
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.encoders import DGCNNSettings
 from robotdiffuse.learning.exported_model import ExportedModel
@@ -15,9 +16,6 @@ from robotdiffuse.learning.weight_files import RobotIdentity, weights_for
 from robotdiffuse.planning.diffusion import Diffusion, DiffusionSettings, encode
 from robotdiffuse.scenes.surface_points import sample_surface
 
-PANDA = rd.load_robot("panda")
-LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
-RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 BALL = rd.Sphere([0.5, 0.0, 0.4], 0.15, name="ball")
 PROBLEM = rd.Problem(PANDA, rd.Scene([BALL]), LEFT, rd.JointGoal(RIGHT[None]))
 MODEL = Diffusion().network(PANDA)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.panda import GOAL, PANDA, START
 from helpers.refusals import refuses
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.collision.exact_meshes import ExactCollision
@@ -14,15 +15,13 @@ from robotdiffuse.planning.pipeline.moving_obstacles import GRID_STEP, WAITED, e
 from robotdiffuse.trajectories.speed_limits import TimingSettings, jerk_limits
 from robotdiffuse.trajectories.timing import StopGraph, time_parameterize
 
-PANDA = rd.load_robot("panda")
-START, END = np.array([-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]), np.array([1.0, 0.3, 0, -1.8, 0, 2.1, 0.8])
 CROSSING = rd.MovingObstacle(rd.Sphere([0.95, 0.0, 0.45], 0.12, name="ball"), velocity=[-0.15, 0, 0])
 """Crosses the path when the arm would pass at full speed, then goes on over the base."""
 PASSING = rd.MovingObstacle(rd.Box([0.55, -0.5, 0.4], [0.1, 0.1, 0.8], name="cart"), velocity=[0, 0.3, 0])
 
 
 def problem(*moving: rd.MovingObstacle, **more: object) -> rd.Problem:
-    return rd.Problem(PANDA, rd.Scene(), START, END, moving=moving, **more)  # type: ignore[arg-type]
+    return rd.Problem(PANDA, rd.Scene(), START, GOAL, moving=moving, **more)  # type: ignore[arg-type]
 
 
 def clearances(motion: rd.Trajectory, obstacle: rd.MovingObstacle) -> list[float]:
@@ -69,7 +68,7 @@ def test_the_earliest_schedule_waits_for_a_passing_obstacle() -> None:
 
 UPRIGHT = rd.AxisCone("panda_hand", [0, 0, 1], [0, 0, -1], 0.2)
 BESIDE: dict[str, dict[str, object]] = {
-    "waypoints": {"waypoints": [(START + END) / 2 - [0, 0.3, 0, 0, 0, 0, 0], START]},
+    "waypoints": {"waypoints": [(START + GOAL) / 2 - [0, 0.3, 0, 0, 0, 0, 0], START]},
     "constraints": {"constraints": [UPRIGHT]},
     "payload": {"payload": rd.Payload(2.0)},
     "all": {"waypoints": [[-0.6, *START[1:]]], "constraints": [UPRIGHT]},
@@ -100,7 +99,7 @@ def test_other_requests_hold_among_moving_obstacles(asked: str) -> None:
 def test_a_stop_at_a_waypoint_is_not_gone_through() -> None:
     """The waypoint is on the straight line, so the motion would not stop by itself; a ball is at the waypoint
     first."""
-    middle = (START + END) / 2
+    middle = (START + GOAL) / 2
     at = PANDA.fk(middle, "panda_hand")[:3, 3]
     ball = rd.MovingObstacle(rd.Sphere(at, 0.08, name="ball"), velocity=[0.3, 0, 0.3])
     task = problem(ball, waypoints=[middle])
@@ -115,7 +114,7 @@ def test_corners_are_rounded_as_far_as_the_planner_certified() -> None:
     """If no rounding is allowed, the motion stops at the corner; if little is allowed, it passes more slowly
     than by default."""
     middle = np.array([0.0, 0.9, 0, -1.8, 0, 2.1, 0.8])
-    path = rd.Path(PANDA.joint_names, np.stack([START, middle, END]))
+    path = rd.Path(PANDA.joint_names, np.stack([START, middle, GOAL]))
     shortest = []
     for deviations in (None, np.zeros(3), np.full(3, 0.02)):
         timing = time_parameterize(PANDA, path, lambda _: True, lambda _: True, deviations=deviations)
@@ -127,7 +126,7 @@ def test_corners_are_rounded_as_far_as_the_planner_certified() -> None:
 
 def test_each_row_of_a_path_through_waypoints_has_its_corner_deviation() -> None:
     """Regression: the deviations were those of the last segment only."""
-    tight = rd.Problem(PANDA, rd.Scene([rd.Sphere([0.55, 0.0, 0.5], 0.15)]), START, END)
+    tight = rd.Problem(PANDA, rd.Scene([rd.Sphere([0.55, 0.0, 0.5], 0.15)]), START, GOAL)
     mid = rd.load_planner("aorrtc").plan(tight, 10.0)
     assert mid.path is not None
     task = replace(tight, waypoints=[mid.trajectory.positions[len(mid.trajectory.times) // 3]])
@@ -140,7 +139,7 @@ def test_each_row_of_a_path_through_waypoints_has_its_corner_deviation() -> None
 
 @pytest.mark.parametrize("velocity", [np.eye(7)[0] * 2.0, np.array([-0.5, 0.1, 0.3, -0.4, 0.1, 0, 0.6])])
 def test_motions_begin_with_the_start_velocity(velocity: np.ndarray) -> None:
-    task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
+    task = rd.Problem(PANDA, rd.Scene(), START, GOAL, start_velocity=velocity)
     found = rd.load_planner("rrt_connect").plan(task, 60.0)
     assert found.solved, found.reason
     assert np.allclose(found.trajectory.velocities[0], velocity, atol=1e-9)
@@ -155,7 +154,7 @@ def test_motions_begin_with_the_start_velocity(velocity: np.ndarray) -> None:
 
 def test_start_velocities_are_within_the_limits_or_rest() -> None:
     def given(velocity: object) -> rd.Problem:
-        return rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)  # type: ignore[arg-type]
+        return rd.Problem(PANDA, rd.Scene(), START, GOAL, start_velocity=velocity)  # type: ignore[arg-type]
 
     for velocity, message in (
         ([np.nan] * 7, "start_velocity is .*; it must be 7 finite numbers"),
@@ -175,7 +174,7 @@ def test_start_velocities_are_within_the_limits_or_rest() -> None:
 @pytest.mark.parametrize(("first", "jerk"), [(PANDA.upper[0] - 0.01, None), (START[0], 0.1)])
 def test_a_start_velocity_that_cannot_stop_is_invalid(first: float, jerk: float | None) -> None:
     start = np.array([first, *START[1:]])
-    task = rd.Problem(PANDA, rd.Scene(), start, END, start_velocity=np.eye(7)[0] * 2.0)
+    task = rd.Problem(PANDA, rd.Scene(), start, GOAL, start_velocity=np.eye(7)[0] * 2.0)
     found = rd.load_planner("rrt_connect").plan(task, jerk=jerk)
     assert found.status is rd.Status.INVALID_START
     assert "panda_joint1 cannot stop" in found.reason

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.panda import GOAL, PANDA, START
 from helpers.refusals import refuses
 from robotdiffuse.collision.moving_obstacles import MovingCollision
 from robotdiffuse.planning.reactive.timed_path import JerkFilter, SpeedProfile, TimedPath
@@ -19,8 +20,6 @@ from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.trajectories.speed_limits import jerk_limits
 from robotdiffuse.trajectories.timing_kernel import rounded_line
 
-PANDA = rd.load_robot("panda")
-START, END = np.array([-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]), np.array([1.0, 0.3, 0, -1.8, 0, 2.1, 0.8])
 SPEED = 0.4
 PERIOD = 0.02
 FLOOR = rd.Box([0, 0, -0.06], [2, 2, 0.1], name="floor")
@@ -38,7 +37,7 @@ def balls(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 def loop(places: np.ndarray) -> rd.Replanner:
     moving = [rd.MovingObstacle(rd.Sphere(place, 0.1), max_speed=SPEED) for place in places]
-    return rd.Replanner(rd.Problem(PANDA, rd.Scene([FLOOR]), START, END, moving=moving))
+    return rd.Replanner(rd.Problem(PANDA, rd.Scene([FLOOR]), START, GOAL, moving=moving))
 
 
 @pytest.mark.parametrize(("count", "seed"), [(1, 0), (3, 2)])
@@ -74,7 +73,7 @@ def test_every_command_is_a_certified_stop(count: int, seed: int) -> None:
         if command.arrived:
             break
     assert command.arrived and renewed > 10
-    assert np.allclose(motion.positions[-1], END, atol=1e-9)
+    assert np.allclose(motion.positions[-1], GOAL, atol=1e-9)
 
 
 def test_same_observations_give_the_same_motions() -> None:
@@ -135,7 +134,7 @@ def test_unseen_obstacles_grow_with_time() -> None:
 
 
 def test_the_arm_waits_for_an_obstacle_at_the_goal() -> None:
-    place = PANDA.fk(END)[:3, 3]
+    place = PANDA.fk(GOAL)[:3, 3]
     replanner = loop(place[None])
     for k in range(100):
         command = replanner.step({"sphere": place}, k * PERIOD)
@@ -164,12 +163,12 @@ def test_replanners_that_cannot_begin() -> None:
     for fields, message in (
         ({"moving": []}, r"problem\.moving is empty"),
         ({"start": [0, 1.5, 0, -0.5, 0, 2.1, 0.8]}, "the replanner cannot begin: the start is in collision"),
-        ({"waypoints": [END]}, r"problem\.waypoints: the replanner does not support it"),
+        ({"waypoints": [GOAL]}, r"problem\.waypoints: the replanner does not support it"),
         ({"constraints": [UPRIGHT]}, r"problem\.constraints: the replanner does not support it"),
         ({"payload": rd.Payload(0.5, link="panda_hand")}, r"problem\.payload: the replanner does not"),
     ):
         moving = [rd.MovingObstacle(rd.Sphere([3, 0, 0], 0.1), max_speed=0.1)]
-        problem = rd.Problem(PANDA, rd.Scene([FLOOR]), START, END, moving=moving)
+        problem = rd.Problem(PANDA, rd.Scene([FLOOR]), START, GOAL, moving=moving)
         refuses(message, rd.Replanner, replace(problem, **fields))
 
 
@@ -195,7 +194,7 @@ def test_a_new_goal_is_reached_from_where_the_motion_ends(goal: str) -> None:
 def test_a_goal_in_collision_leaves_the_old_one() -> None:
     replanner = loop(np.array([[0.0, -3.0, 0.5]]))
     refuses("cannot take this goal: the goal is in collision", replanner.set_goal, [0, 1.5, 0, -0.5, 0, 2.1, 0.8])
-    assert np.allclose(replanner.problem.goal.positions, END)  # type: ignore[union-attr]
+    assert np.allclose(replanner.problem.goal.positions, GOAL)  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.panda import HOME, LEFT, PANDA, RIGHT
 from helpers.refusals import refuses
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import explain_collision
@@ -24,12 +25,8 @@ from robotdiffuse.problems.held_out import held_out_problem
 from robotdiffuse.trajectories.simplification import simplify, tighten
 from robotdiffuse.trajectories.timing import Timing, time_parameterize
 
-PANDA = rd.load_robot("panda")
 WALL = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8], name="wall")])
-LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
-RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 AROUND = rd.Problem(PANDA, WALL, LEFT, RIGHT)
-READY = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 
 
 def ends() -> tuple[np.ndarray, np.ndarray]:
@@ -208,16 +205,16 @@ def test_a_line_that_is_always_refused_does_not_end_the_search(monkeypatch: pyte
 @pytest.mark.parametrize("end", ["start", "goal"])
 def test_ends_free_by_the_meshes_but_not_by_the_spheres_are_left_or_named(end, monkeypatch):
     """Regression: a start or goal without a way out was an immediate timeout."""
-    ahead = PANDA.fk(READY, "panda_hand")[:3, 3] - [0.0, 0.0, 0.2]
+    ahead = PANDA.fk(HOME, "panda_hand")[:3, 3] - [0.0, 0.0, 0.2]
     radii = np.arange(0.1, 0.05, -0.0002)
     scenes = (rd.Scene([rd.Sphere(ahead, radius, name="ball")]) for radius in radii)
-    scene = next(scene for scene in scenes if explain_collision(PANDA, scene, READY) is None)
+    scene = next(scene for scene in scenes if explain_collision(PANDA, scene, HOME) is None)
     checker = CollisionChecker(PANDA, scene)
-    lead = retreat(checker, READY)
-    assert lead is not None and checker.free(np.stack([READY, lead])).tolist() == [False, True]
-    assert np.abs(lead - READY).max() < 0.3
+    lead = retreat(checker, HOME)
+    assert lead is not None and checker.free(np.stack([HOME, lead])).tolist() == [False, True]
+    assert np.abs(lead - HOME).max() < 0.3
     monkeypatch.setattr(start_goal, "RETREAT_STEPS", 1)
-    rows = (READY, LEFT) if end == "start" else (LEFT, READY)
+    rows = (HOME, LEFT) if end == "start" else (LEFT, HOME)
     result = RRTConnect().plan(rd.Problem(PANDA, scene, rows[0], rows[1]))
     assert result.status is (rd.Status.INVALID_START if end == "start" else rd.Status.INVALID_GOAL)
     told = re.search(r"spheres of (\w+) reach ([\d.]+) mm into ball, .* are ([\d.]+) mm apart", result.reason)

@@ -13,15 +13,13 @@ from scipy.sparse.csgraph import dijkstra
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
+from helpers.panda import LEFT, PANDA, RIGHT
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.planning.search import rrt_kernel, shared_tree
 from robotdiffuse.planning.search.shared_tree import SharedTreeSearch
 
-PANDA = rd.load_robot("panda")
-LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
-RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 WALL = rd.Scene([rd.Box([0.45, 0.0, 0.25], [0.3, 0.05, 0.5], name="wall")])
 ENDLESS = shared_tree.SharedTreeSettings(improvement=0.0)
 TOUCHING = replace(ENDLESS, safety_distance=0.0)

@@ -4,16 +4,15 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.panda import LEFT, PANDA, RIGHT
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.planning.search.time_optimization import TimeOptimization
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.trajectories.speed_limits import TimingSettings
 from robotdiffuse.trajectories.straight_line import straight_line_time
 
-ROBOT = rd.load_robot("panda")
-LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 WALL = rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8])
-AROUND = rd.Problem(ROBOT, rd.Scene([WALL]), LEFT, LEFT * [-1, 1, 1, 1, 1, 1, 1])
+AROUND = rd.Problem(PANDA, rd.Scene([WALL]), LEFT, RIGHT)
 DETOUR = LEFT + np.array([[0, 0, 0, 0, 0, 0, 0], [0.6, 0.4, 0, 0, 0, 0, 0], [-1.5, 1.2, 0, 0, 0, 0, 0]])
 """Joint 1 is limited by its velocity, joint 2 by its acceleration."""
 
@@ -21,13 +20,13 @@ DETOUR = LEFT + np.array([[0, 0, 0, 0, 0, 0, 0], [0.6, 0.4, 0, 0, 0, 0, 0], [-1.
 @pytest.mark.parametrize("path", [DETOUR, DETOUR[[0, 2]]], ids=["detour", "straight line"])
 def test_the_slowest_joint_is_the_bound(path: np.ndarray) -> None:
     ends = path[0], path[-1:]
-    space = StartGoal(CollisionChecker(ROBOT, rd.Scene()), *ends).space(0.05, 0.0)
-    found = TimeOptimization(ROBOT, TimingSettings(), *ends, seed=0)
+    space = StartGoal(CollisionChecker(PANDA, rd.Scene()), *ends).space(0.05, 0.0)
+    found = TimeOptimization(PANDA, TimingSettings(), *ends, seed=0)
     found.offer(space, path, "search")
     for _ in range(100):
         found.improve(space)
-    limits = ROBOT.velocity, ROBOT.acceleration
-    alone = max(straight_line_time(path[0, [j]], path[-1, [j]], *(limit[[j]] for limit in limits)) for j in range(ROBOT.dof))
+    limits = PANDA.velocity, PANDA.acceleration
+    alone = max(straight_line_time(path[0, [j]], path[-1, [j]], *(limit[[j]] for limit in limits)) for j in range(PANDA.dof))
     best = found.best
     assert best is not None and best.time == pytest.approx(alone, rel=0.03)
     assert best.time < 0.94 * straight_line_time(path[0], path[-1], *limits)

@@ -8,8 +8,8 @@ import pytest
 import trimesh
 
 from helpers.box_arm import box_arm, box_mesh
+from helpers.boxes import surface
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.robots.bodies import Surface
 from robotdiffuse.robots.fitting.convex_parts import convex_hull
 from robotdiffuse.robots.fitting.covering_spheres import cover
 from robotdiffuse.robots.fitting.preparation import AddReport
@@ -151,10 +151,7 @@ def test_false_collisions_of_parts_after_true_ones_are_counted() -> None:
     """A box slides through two plates; the convex part of the plates fills the space between them."""
     plates = [trimesh.creation.box((0.02, 0.2, 0.2)).apply_translation((x, 0, 0)) for x in (0.0, 0.3)]
     box = trimesh.creation.box((0.04, 0.04, 0.04))
-    surfaces = {
-        link: tuple(Surface(np.array(mesh.vertices), np.array(mesh.faces)) for mesh in meshes)
-        for link, meshes in {"plates": plates, "box": [box]}.items()
-    }
+    surfaces = {"plates": tuple(map(surface, plates)), "box": (surface(box),)}
     parts = {link: (convex_hull(np.concatenate([one.vertices for one in pieces])),) for link, pieces in surfaces.items()}
     slide = Joint("slide", "prismatic", "plates", "box", np.eye(4), np.array([1.0, 0, 0]), -0.1, 0.4)
     spheres = {link: cover(part) for link, (part,) in parts.items()}

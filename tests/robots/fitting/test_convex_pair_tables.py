@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from helpers.boxes import surface
 from helpers.quick_preparation import coarse_grids
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
@@ -33,15 +34,13 @@ QUICK = PreparationSettings(
 
 
 def box(size: tuple[float, ...], at: tuple[float, ...]) -> Surface:
-    mesh = trimesh.creation.box(size, trimesh.transformations.translation_matrix(at))
-    return Surface(np.array(mesh.vertices), np.array(mesh.faces))
+    return surface(trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)))
 
 
 def disc(radius: float, thickness: float) -> Surface:
     """The surface of a disc whose axis is x."""
     turned = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0])
-    mesh = trimesh.creation.cylinder(radius, thickness, transform=turned)
-    return Surface(np.array(mesh.vertices), np.array(mesh.faces))
+    return surface(trimesh.creation.cylinder(radius, thickness, transform=turned))
 
 
 def fork() -> tuple[Robot, dict[str, tuple[Surface, ...]]]:

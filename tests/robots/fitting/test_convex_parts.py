@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from helpers.boxes import boxes, surface
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_parts import (
     PartSettings,
@@ -15,28 +16,6 @@ from robotdiffuse.robots.fitting.convex_parts import (
     planes_of,
     simplified,
 )
-
-
-def surface(mesh: trimesh.Trimesh) -> Surface:
-    return Surface(np.array(mesh.vertices), np.array(mesh.faces))
-
-
-def _together(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    made = trimesh.util.concatenate(meshes)
-    assert isinstance(made, trimesh.Trimesh)
-    return made
-
-
-def boxes(*corners: tuple[tuple[float, ...], tuple[float, ...]]) -> trimesh.Trimesh:
-    """A mesh of axis-aligned boxes [low, high], with inner walls where boxes meet."""
-    made = [
-        trimesh.creation.box(
-            np.subtract(high, low), transform=trimesh.transformations.translation_matrix(np.add(low, high) / 2)
-        )
-        for low, high in corners
-    ]
-    return _together(made)
-
 
 L = boxes(((0, 0, 0), (0.3, 0.1, 0.1)), ((0, 0, 0.1), (0.1, 0.1, 0.4)))
 FRAME = boxes(

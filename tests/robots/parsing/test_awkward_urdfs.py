@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 
 import robotdiffuse as rd
 from helpers.awkward_urdfs import REFUSED, WORKS
+from helpers.boxes import boxes
 from helpers.made_arms import BALL, chain, joint, link, row, written
 from helpers.quick_preparation import QUICK, coarse_grids
 from helpers.refusals import refuses
@@ -91,16 +91,10 @@ def test_an_arm_that_is_never_free_is_refused_with_the_pair_to_allow(tmp_path: P
 def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:
     """Regression: goals of Fetch and Baxter were in false collision, since the arm touches convex parts of the
     torso, but not the torso."""
-    walls = [
-        trimesh.creation.box(np.subtract(high, low), trimesh.transformations.translation_matrix(middle))
-        for low, high in (
-            ((-0.3, -0.2, 0), (0.3, 0.2, 0.05)),
-            ((0.25, -0.2, 0.05), (0.3, 0.2, 0.4)),
-            ((-0.3, -0.2, 0.05), (-0.25, 0.2, 0.4)),
-        )
-        for middle in [np.add(low, high) / 2]
-    ]
-    trimesh.util.concatenate(walls).export(tmp_path / "trough.stl")
+    trough = boxes(
+        ((-0.3, -0.2, 0), (0.3, 0.2, 0.05)), ((0.25, -0.2, 0.05), (0.3, 0.2, 0.4)), ((-0.3, -0.2, 0.05), (-0.25, 0.2, 0.4))
+    )
+    trough.export(tmp_path / "trough.stl")
     mesh = '<collision><geometry><mesh filename="trough.stl"/></geometry></collision>'
     stand = link("trough", mesh) + joint("stand", "base", "trough", "fixed", xyz="-0.1 0 -0.1")
     urdf = written(tmp_path, stand, chain("base", row("j", 3)))

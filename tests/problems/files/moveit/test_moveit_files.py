@@ -11,7 +11,8 @@ import trimesh
 import yaml
 
 import robotdiffuse as rd
-from helpers.made_arms import read_urdf
+from helpers.made_arms import joint, link, read_urdf, written
+from helpers.panda import PANDA
 from helpers.refusals import refuses
 from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_about, rotation_from_quaternion, transform
@@ -31,23 +32,9 @@ from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_fold
 MOTION_BENCH_MAKER = Path(__file__).parents[3] / "files" / "motion_bench_maker"
 QUARTER = [0, 0, 0.7071067811865476, 0.7071067811865476]
 """xyzw of a quarter turn about z."""
-MOUNTED = """<robot name="mounted">
-  <link name="world"/><link name="stand"/>
-  <link name="base"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
-  <link name="arm"><collision>
-    <origin xyz="0.3 0 0"/><geometry><box size="0.4 0.05 0.05"/></geometry></collision>
-  </link>
-  <joint name="mount" type="fixed"><parent link="world"/><child link="stand"/>
-    <origin xyz="1 2 0.5" rpy="0 0 1.5707963267948966"/></joint>
-  <joint name="rail" type="{kind}"><parent link="stand"/><child link="base"/><origin xyz="0 0 0.3"/>
-    <axis xyz="1 0 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
-  <joint name="turn" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
-    <limit lower="-3" upper="3" velocity="1" effort="1"/></joint>
-</robot>"""
-"""An arm on a stand in the world: its base is not the root of the URDF."""
-
-
-PANDA = rd.load_robot("panda")
+MOUNT = """<joint name="mount" type="fixed"><parent link="world"/><child link="stand"/>
+  <origin xyz="1 2 0.5" rpy="0 0 1.5707963267948966"/></joint>"""
+TURN = link("arm") + joint("turn", "base", "arm", xyz="0 0 0", axis="0 0 1")
 
 
 def scene_data(**world: object) -> dict[str, Any]:
@@ -238,7 +225,7 @@ def test_a_scene_and_a_problem_file_allow_contacts(tmp_path: Path) -> None:
     names = [entry["id"] for entry in data["world"]["collision_objects"]]
     data["allowed_collision_matrix"] = matrix(["panda_hand", names[0], "gone"], [("panda_hand", names[0])])
     file.write_text(yaml.safe_dump(data))
-    scene, _ = read_moveit_scene(file, rd.load_robot("panda"))
+    scene, _ = read_moveit_scene(file, PANDA)
     assert scene.allowed_contacts == ((names[0], ("panda_hand",)),)
     problem = {"robot": "panda", "scene": "scene0001.yaml", "request": "request0001.yaml"}
     (tmp_path / "problem.yaml").write_text(yaml.safe_dump(problem | {"allowed_contacts": {names[1]: "all"}}))
@@ -310,13 +297,9 @@ def test_fixed_joints_of_the_robot_are_known_where_they_stand(tmp_path: Path) ->
 
 
 def test_a_mimic_joint_elsewhere_than_its_master_puts_it_is_a_note(tmp_path: Path) -> None:
-    fingers = """<link name="left"/><link name="right"/>
-      <joint name="grip" type="prismatic"><parent link="arm"/><child link="left"/><axis xyz="0 1 0"/>
-        <limit lower="0" upper="0.04" velocity="1" effort="1"/></joint>
-      <joint name="follow" type="prismatic"><parent link="arm"/><child link="right"/><axis xyz="0 1 0"/>
-        <limit lower="0" upper="0.04" velocity="1" effort="1"/><mimic joint="grip"/></joint></robot>"""
-    (tmp_path / "arm.urdf").write_text(MOUNTED.format(kind="fixed").replace("</robot>", fingers))
-    robot = read_urdf(tmp_path / "arm.urdf", base="base", tip="arm")
+    slide = {"kind": "prismatic", "axis": "0 1 0", "limits": 'lower="0" upper="0.04"'}
+    follow = joint("follow", "arm", "right", more='<mimic joint="grip"/>', **slide)
+    robot = mounted(tmp_path, "fixed", link("left", ""), joint("grip", "arm", "left", **slide), link("right", ""), follow)
     here = {"joint_state": {"name": ["turn", "grip", "follow"], "position": [0, 0.03, 0.01]}}
     goal = {"joint_constraints": [{"joint_name": "turn", "position": 0.1}]}
     (tmp_path / "scene0001.yaml").write_text("{}")
@@ -402,7 +385,7 @@ def test_scaling_factors_padding_and_the_velocity_of_a_start_state_are_noted() -
         "start_state.joint_state.velocity [0.0, 0.3] is ignored: the motion begins at rest",
     }
     padded = [{"link_name": "panda_hand", "padding": 0.02}, {"link_name": "b", "padding": 0.0}]
-    notes = scene_robot_notes({"link_padding": padded}, rd.load_robot("panda"))
+    notes = scene_robot_notes({"link_padding": padded}, PANDA)
     assert notes == ("the scene's link_padding of panda_hand is ignored",)
 
 
@@ -430,29 +413,27 @@ def test_wrong_requests(case: str) -> None:
 
 
 Z = np.array([0.0, 0.0, 1.0])
-WHEELED = """<robot name="wheeled">
-  <link name="root"/><link name="x"/><link name="y"/>
-  <link name="base"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
-  <link name="arm"><collision>
-    <origin xyz="0.3 0 0"/><geometry><box size="0.4 0.05 0.05"/></geometry></collision>
-  </link>
-  {above}
-  <joint name="turn" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
-    <limit lower="-3" upper="3" velocity="1" effort="1"/></joint>
-</robot>"""
-"""An arm on wheels; joints above its base stand for these."""
-SLIDES = "".join(
-    f'<joint name="to_{child}" type="prismatic"><parent link="{parent}"/><child link="{child}"/>'
-    f'<axis xyz="{axis}"/><limit lower="-9" upper="9" velocity="1" effort="1"/></joint>'
-    for parent, child, axis in (("root", "x", "1 0 0"), ("x", "y", "0 1 0"))
-)
+
+
+def wheels(second: str) -> tuple[str, ...]:
+    """Joints above a base that stand for its wheels: two slides, the second of which has this axis, and a turn."""
+    return (
+        joint("to_x", "root", "x", "prismatic", xyz="0 0 0", axis="1 0 0"),
+        joint("to_y", "x", "y", "prismatic", xyz="0 0 0", axis=second),
+        joint("yaw", "y", "base", "continuous", xyz="0 0 0", axis="0 0 1", limits=""),
+    )
+
+
+PLANAR = '<joint name="drive" type="planar"><parent link="root"/><child link="base"/></joint>'
 WHEELS = {
-    "three joints": SLIDES + '<joint name="yaw" type="continuous"><parent link="y"/><child link="base"/>'
-    '<axis xyz="0 0 1"/></joint>',
-    "a planar joint": '<joint name="drive" type="planar"><parent link="root"/><child link="base"/></joint>'
-    '<joint name="a" type="fixed"><parent link="base"/><child link="x"/></joint>'
-    '<joint name="b" type="fixed"><parent link="base"/><child link="y"/></joint>',
+    "three joints": wheels("0 1 0"),
+    "a planar joint": (PLANAR, joint("a", "base", "x", "fixed"), joint("b", "base", "y", "fixed")),
 }
+
+
+def wheeled(folder: Path, above: tuple[str, ...]) -> rd.Robot:
+    """An arm whose base has these joints above it."""
+    return read_urdf(written(folder, *(link(name, "") for name in ("root", "x", "y")), *above, TURN), base="base")
 
 
 def place(data: dict[str, Any], robot: rd.Robot = PANDA) -> list[float]:
@@ -472,10 +453,12 @@ def state(frame: str, *translations: list[float]) -> dict[str, Any]:
     return {"robot_state": {"multi_dof_joint_state": floating}}
 
 
-def mounted(folder: Path, kind: str) -> rd.Robot:
-    """The robot as `robot add --base base` stores it, but without spheres, whose fitting takes long."""
-    (folder / "mounted.urdf").write_text(MOUNTED.format(kind=kind))
-    write_robot_folder(read_urdf(folder / "mounted.urdf", base="base"), folder / "mounted", {})
+def mounted(folder: Path, kind: str, *more: str) -> rd.Robot:
+    """An arm on a stand in the world, whose base is not the root of the URDF, as `robot add --base base` stores it, but without
+    spheres, whose fitting takes long."""
+    rail = joint("rail", "stand", "base", kind, xyz="0 0 0.3", axis="1 0 0")
+    file = written(folder, link("world", ""), link("stand", ""), MOUNT, rail, TURN, *more)
+    write_robot_folder(read_urdf(file, base="base", tip="arm"), folder / "mounted", {})
     return read_robot_folder(folder / "mounted")
 
 
@@ -506,20 +489,17 @@ def test_scene_in_the_world_of_a_robot_whose_base_moves_there_is_refused(tmp_pat
     assert place(at("base"), robot) == [0, 0, 0]
 
 
-@pytest.mark.parametrize("wheels", WHEELS)
-def test_a_scene_places_what_a_mobile_base_carries(tmp_path: Path, wheels: str) -> None:
+@pytest.mark.parametrize("above", WHEELS.values(), ids=WHEELS)
+def test_a_scene_places_what_a_mobile_base_carries(tmp_path: Path, above: tuple[str, ...]) -> None:
     """Regression: every scene was refused for a Fetch whose URDF has joints for its wheels, since a joint moves
     its base."""
-    (tmp_path / "wheeled.urdf").write_text(WHEELED.format(above=WHEELS[wheels]))
-    robot = read_urdf(tmp_path / "wheeled.urdf", base="base")
+    robot = wheeled(tmp_path, above)
     assert robot.root == robot.base == "base"
     assert place(at("world", **state("world", [0.5, 0, 0])), robot) == [-0.5, 0, 0]
 
 
 def test_a_lift_is_no_mobile_base(tmp_path: Path) -> None:
-    tilted = WHEELS["three joints"].replace('"0 1 0"', '"0 0 1"')
-    (tmp_path / "wheeled.urdf").write_text(WHEELED.format(above=tilted))
-    assert read_urdf(tmp_path / "wheeled.urdf", base="base").root == "root"
+    assert wheeled(tmp_path, wheels("0 0 1")).root == "root"
 
 
 def test_scene_in_a_frame_that_the_robot_is_placed_in(tmp_path: Path) -> None:
@@ -531,29 +511,20 @@ def test_scene_in_a_frame_that_the_robot_is_placed_in(tmp_path: Path) -> None:
     expected = (turn @ (-np.array([3.0, 0, 0]) - base_in_root)).round(9).tolist()
     for frame in ("odom", "/odom", ""):
         assert place(at(frame, **state("odom", [3, 0, 0])), robot) == expected
-    panda = rd.load_robot("panda")
     with pytest.raises(rd.InputError, match=r"unknown frame_id of header: 'world'; known: odom, panda_link0"):
-        place(at("world", **state("odom", [3, 0, 0])), panda)
+        place(at("world", **state("odom", [3, 0, 0])))
     for named in ("world", "panda_link0", ""):
-        assert place(at("world", **state(named, [3, 0, 0])), panda) == [-3, 0, 0]
-    refuses("has 2 transforms; it must have one", place, at("world", **state("odom", [3, 0, 0], [0, 0, 0])), panda)
+        assert place(at("world", **state(named, [3, 0, 0]))) == [-3, 0, 0]
+    refuses("has 2 transforms; it must have one", place, at("world", **state("odom", [3, 0, 0], [0, 0, 0])))
 
 
 def test_links_of_the_robot_are_frames_where_they_stand(tmp_path: Path) -> None:
     """A link named world is a frame even if it is not the root, and a file cannot give a link of the robot
     another pose. Regression: `robot add --base` dropped the transform between root and base, and verified
     motions were in collision by 8 cm."""
-    text = MOUNTED.format(kind="fixed").replace(
-        '<link name="world"/>',
-        """<link name="map"/><link name="world"/><link name="camera"/>
-        <joint name="on" type="fixed"><parent link="map"/><child link="world"/><origin xyz="0 0 7"/></joint>
-        <joint name="eye" type="fixed"><parent link="base"/><child link="camera"/>
-        <origin xyz="0 0 1"/></joint>""",
-    )
-    (tmp_path / "arm.urdf").write_text(text)
-    robot = read_urdf(tmp_path / "arm.urdf", base="base")
-    write_robot_folder(robot, tmp_path / "kept", {})
-    robot = read_robot_folder(tmp_path / "kept")
+    eye = joint("eye", "base", "camera", "fixed", xyz="0 0 1")
+    on = joint("on", "map", "world", "fixed", xyz="0 0 7")
+    robot = mounted(tmp_path, "fixed", link("map", ""), link("camera", ""), on, eye)
     assert place(at("camera"), robot) == [0, 0, 1]
     assert place(at("base"), robot) == [0, 0, 0]
     assert place(at("world"), robot) == [-2, 1, -0.8]
