@@ -1,9 +1,11 @@
 """Explorer: its motions keep its policy in scenes that it knows only by simulated cameras."""
 
 from dataclasses import replace
+from functools import cache
 from inspect import unwrap
 from itertools import islice, pairwise
 from threading import Thread
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,11 +34,18 @@ PROBLEM = rd.Problem(PANDA, rd.Scene([FLOOR, WALL]), LEFT, RIGHT)
 """From one side of a wall to the other."""
 
 
-def explorer(policy: str = "strict", seen: bool = True) -> rd.Explorer:
-    settings = rd.ExplorerSettings(policy=policy, time_limit=1.0, look_attempts=2, max_looks=2)
+@cache
+def view() -> rd.DepthView:
+    return simulated.camera_beside(PROBLEM, None, 0)
+
+
+def explorer(policy: str = "strict", seen: bool = True, goal: Any = None, **more: Any) -> rd.Explorer:
+    settings = rd.ExplorerSettings(**{"policy": policy, "time_limit": 1.0, "look_attempts": 2, "max_looks": 2} | more)
     out = rd.Explorer(PANDA, [simulated.wrist_camera(PANDA)], rd.Scene([FLOOR]), ZONE, settings)
     if seen:
-        out.observe(simulated.camera_beside(PROBLEM, None, 0))
+        out.observe(view())
+    if goal is not None:
+        out.set_goal(goal)
     return out
 
 
@@ -58,8 +67,7 @@ def test_the_loop_ends_and_strict_motions_do_not_collide(policy: str) -> None:
 )
 def test_an_image_that_sees_through_the_arm_is_refused(factor: float, message: str) -> None:
     arm = explorer(seen=False)
-    view = simulated.camera_beside(PROBLEM, None, 0)
-    refuses(f"check the camera of the view: .*{message}", arm.observe, replace(view, depth=factor * view.depth))
+    refuses(f"check the camera of the view: .*{message}", arm.observe, replace(view(), depth=factor * view().depth))
     assert arm.map.is_blind
 
 
@@ -68,8 +76,7 @@ def test_a_negative_seed_is_refused() -> None:
 
 
 def test_a_view_of_another_thread_waits_for_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    arm = explorer()
-    arm.set_goal(RIGHT)
+    arm = explorer(goal=RIGHT)
     before = arm.map.unknown
     view = simulated.camera_beside(replace(PROBLEM, scene=rd.Scene([FLOOR])), None, 0)
     observer = Thread(target=arm.observe, args=(view,))
@@ -89,15 +96,13 @@ def test_a_view_of_another_thread_waits_for_the_step(monkeypatch: pytest.MonkeyP
 
 def test_an_arm_at_a_goal_pose_is_done() -> None:
     # it went on for ever: only configurations were compared
-    one = explorer()
     q = PROBLEM.start
-    one.set_goal(rd.PoseGoal("panda_hand", PANDA.fk(q + 0.05, "panda_hand")))
+    one = explorer(goal=rd.PoseGoal("panda_hand", PANDA.fk(q + 0.05, "panda_hand")))
     assert [one.next(at).kind == DONE for at in (q, q + 0.05)] == [False, True]
 
 
 def test_strict_motions_enter_no_voxel_that_was_not_seen_free() -> None:
-    one = explorer()
-    one.set_goal(PROBLEM.start + 0.05)
+    one = explorer(goal=PROBLEM.start + 0.05)
     step = one.next(PROBLEM.start)
     assert step.kind in ("go", "look")
     path = step.motion.path
@@ -169,8 +174,7 @@ def test_what_keeps_the_arm_from_going_is_said() -> None:
     step = blind.next(HOME)
     assert step.kind == "look" and step.motion is None and "nothing was seen yet" in step.reason
     still = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), settings=rd.ExplorerSettings(time_limit=1.0))
-    view = simulated.camera_beside(PROBLEM, None, 0)
-    still.observe(replace(view, depth=np.zeros_like(view.depth)))
+    still.observe(replace(view(), depth=np.zeros_like(view().depth)))
     still.set_goal(PROBLEM.goal)
     step = still.next(PROBLEM.start)
     assert step.kind == "stuck" and "no camera is on the arm" in step.reason
@@ -203,21 +207,19 @@ def test_a_look_is_found_where_a_narrow_gap_alone_leads_out() -> None:
 
 
 def test_stray_points_that_other_views_see_through_are_no_obstacles() -> None:
-    one = explorer(seen=False)
-    view = simulated.camera_beside(PROBLEM, None, 0)
-    depth, (v, u) = view.depth.copy(), (200, 150)
+    one = explorer(seen=False, goal=PROBLEM.start + 0.05)
+    depth, (v, u) = view().depth.copy(), (200, 150)
     depth[v - 8 : v + 8, u - 8 : u + 8] = 1.0
-    fx, fy, cx, cy = view.intrinsics
-    stray = view.T_base_camera @ [(u - cx) / fx, (v - cy) / fy, 1.0, 1.0]
-    one.set_goal(PROBLEM.start + 0.05)
+    fx, fy, cx, cy = view().intrinsics
+    stray = view().T_base_camera @ [(u - cx) / fx, (v - cy) / fy, 1.0, 1.0]
     gaps = []
-    for observed in (replace(view, depth=depth), view, view):
+    for observed in (replace(view(), depth=depth), view(), view()):
         one.observe(observed)
         seen = one.next(PROBLEM.start).seen
         assert seen is not None
         points = np.concatenate([shape.points for shape in seen.shapes if isinstance(shape, rd.PointCloud)])
         gaps.append(np.linalg.norm(points - stray[:3], axis=1).min())
-    assert view.depth[v, u] > 1.1 and gaps[0] < 0.02
+    assert view().depth[v, u] > 1.1 and gaps[0] < 0.02
     assert gaps[-1] > 0.05
 
 
@@ -225,8 +227,7 @@ def test_where_no_look_can_be_reached_the_arm_leaves_a_goal_by_the_way_in() -> N
     camera = replace(simulated.wrist_camera(PANDA), range=0.01)  # no look of it shows anything
     zone = ((-0.36, -0.36, 0.0), (0.9, 0.9, 1.1))  # all that is known; OUTSIDE reaches out of it
     one = rd.Explorer(PANDA, [camera], rd.Scene([FLOOR]), zone, rd.ExplorerSettings(time_limit=1.0))
-    view = simulated.camera_beside(PROBLEM, None, 0)
-    one.observe(replace(view, depth=np.zeros_like(view.depth)))
+    one.observe(replace(view(), depth=np.zeros_like(view().depth)))
     inner = PROBLEM.start + np.array([0.8, 0.0, 0.0, -0.1, 0.0, 0.0, 0.0])
     one.set_goal(inner)
     step = one.next(PROBLEM.start)
@@ -246,11 +247,7 @@ def test_where_no_look_can_be_reached_the_arm_leaves_a_goal_by_the_way_in() -> N
 def test_without_the_network_a_motion_through_space_seen_free_is_certain_enough() -> None:
     """Regression: under `probabilistic` the arm never stopped looking, since the highest stated confidence was
     0.82."""
-    settings = rd.ExplorerSettings(policy="probabilistic", predict=False, time_limit=1.0)
-    one = rd.Explorer(PANDA, [simulated.wrist_camera(PANDA)], rd.Scene([FLOOR]), ZONE, settings)
-    one.observe(simulated.camera_beside(PROBLEM, None, 0))
-    one.set_goal(PROBLEM.start + 0.02)
-    step = one.next(PROBLEM.start)
+    step = explorer("probabilistic", goal=PROBLEM.start + 0.02, predict=False).next(PROBLEM.start)
     assert (step.kind, step.policy, step.confidence) == ("go", "strict", None)
 
 
