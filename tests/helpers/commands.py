@@ -7,6 +7,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import yaml
+
 from robotdiffuse.cli import main
 
 Said = Callable[..., str]
@@ -34,8 +36,13 @@ def python(code: str, status: int = 0, **environment: str) -> subprocess.Complet
     return ended
 
 
+def written(folder: Path, data: object, name: str = "problem.yaml") -> Path:
+    """Writes a file, as YAML if its name ends in that, else as JSON."""
+    file = folder / name
+    file.write_text(yaml.safe_dump(data) if file.suffix == ".yaml" else json.dumps(data))
+    return file
+
+
 def write_problem(folder: Path, name: str = "problem.json", **changes: object) -> Path:
     """Write PROBLEM, with changes, to a file."""
-    file = folder / name
-    file.write_text(json.dumps(PROBLEM | changes))
-    return file
+    return written(folder, PROBLEM | changes, name)

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from numpy import ndarray
 
 import robotdiffuse as rd
+from helpers.commands import written as write_record
 from helpers.made_arms import chain, read_urdf, row, written
 from helpers.refusals import refuses
 from robotdiffuse.certificates.checker import check
@@ -122,11 +122,10 @@ def test_a_pose_out_of_reach_is_named_alone() -> None:
 def test_files_keep_them(tmp_path: Path) -> None:
     pose = {"xyz": [0.7, 0.25, 0.3], "wxyz": [0.0, 1.0, 0.0, 0.0]}
     goal = {"poses": {"left_gripper": pose | {"rpy_tolerance": [0.0, 0.0, 3.1]}, "right_gripper": pose}}
-    file = tmp_path / "problem.yaml"
     base = {"xyz": [0.1, 0.2, 0.3], "wxyz": [0.6, 0.0, 0.0, 0.8]}
     for asked in (goal, {"any": [goal]}):
-        file.write_text(yaml.safe_dump(problem_record(both_hands()[0]) | {"goal": asked, "base": base}))
-        problem = rd.load_problem(file)
+        record = problem_record(both_hands()[0]) | {"goal": asked, "base": base}
+        problem = rd.load_problem(write_record(tmp_path, record))
         kept = problem_record(problem)
         assert problem_record(problem_from_record(kept)) == kept
         each = problem.goal.goals[0] if isinstance(problem.goal, rd.AnyGoal) else problem.goal

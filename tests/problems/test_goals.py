@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from numpy import ndarray
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 import robotdiffuse as rd
+from helpers.commands import written
 from helpers.refusals import refuses
 from robotdiffuse.core.transforms import inverse, rotation_from_rpy, rpy_from_rotation, transform
 from robotdiffuse.problems.files import problem_from_record, problem_record
@@ -163,10 +163,8 @@ def test_files_keep_goals_and_waypoints(tmp_path: Path) -> None:
         "waypoints": [{"joints": MIDDLE}, {"pose": pose | {"xyz_tolerance": [0.1, 0.1, 0.0]}}],
         "blend": [0.0, 0.05],
     }
-    file = tmp_path / "problem.yaml"
     for base in ({}, {"base": {"xyz": [0.1, 0.2, 0.3], "wxyz": [0.6, 0.0, 0.0, 0.8]}}):
-        file.write_text(yaml.safe_dump(record | base))
-        problem = rd.load_problem(file)
+        problem = rd.load_problem(written(tmp_path, record | base))
         kept = problem_record(problem)
         assert problem_record(problem_from_record(kept)) == kept
         assert isinstance(problem.goal, rd.AnyGoal) and isinstance(problem.goal.goals[0], rd.PoseGoal)
@@ -199,10 +197,8 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_goals_are_one_line(case: str, tmp_path: Path) -> None:
     extra, message = WRONG[case]
-    file = tmp_path / "problem.yaml"
     good = {"robot": "panda", "scene": [TABLE], "start": START, "goal": {"joints": END}}
-    file.write_text(yaml.safe_dump(good | extra))
-    refuses(message, rd.load_problem, file)
+    refuses(message, rd.load_problem, written(tmp_path, good | extra))
 
 
 def test_poses_are_drawn_on_as_long_as_none_is_free() -> None:

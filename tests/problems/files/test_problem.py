@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
 import robotdiffuse as rd
+from helpers.commands import written
 from helpers.refusals import refuses
 from robotdiffuse.core.transforms import rotation_about, rotation_from_rpy, transform
 from robotdiffuse.problems.files import load_problems, problem_from_record, problem_record, save_problem
@@ -101,15 +101,9 @@ GOOD: dict[str, Any] = {
 }
 
 
-def written(folder: Path, data: object, ending: str = "yaml") -> Path:
-    file = folder / f"problem.{ending}"
-    file.write_text(yaml.safe_dump(data) if ending == "yaml" else json.dumps(data))
-    return file
-
-
 @pytest.mark.parametrize("ending", ["yaml", "json", "jsonl"])
 def test_problem_file(ending: str, tmp_path: Path) -> None:
-    loaded = rd.load_problem(written(tmp_path, GOOD, ending))
+    loaded = rd.load_problem(written(tmp_path, GOOD, f"problem.{ending}"))
     assert loaded.robot.name == "panda"
     assert loaded.robot.locked["panda_finger_joint1"] == 0.065
     assert [shape.name for shape in loaded.scene.shapes] == ["sphere", "box", "pole"]

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 
 import robotdiffuse as rd
+from helpers.commands import written
 from helpers.refusals import refuses
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.transforms import inverse, rotation_about, transform
@@ -35,12 +35,6 @@ SHAPES: list[Shape] = [
     rd.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], [0.5, 0.6, 0]),
     rd.PointCloud([[0.5, 0.1, 0.9], [0.4, 0.2, 0.8]]),
 ]
-
-
-def written(folder: Path, record: dict[str, Any]) -> Path:
-    file = folder / "problem.yaml"
-    file.write_text(yaml.safe_dump(record))
-    return file
 
 
 @pytest.mark.parametrize("extra", [{"attached": [CUP]}, {"tool": TOOL}, {"tool": TOOL, "attached": [CUP | {"link": "tool"}]}])
