@@ -66,7 +66,7 @@ from robotdiffuse.perception.unknown_space import MIN_RISK
 from robotdiffuse.perception.voxel_grid import FINE
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanRequest
-from robotdiffuse.planning.exploration.looks import next_view, poses_around
+from robotdiffuse.planning.exploration.viewpoints import next_view, poses_around
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.files import load_problems

@@ -19,10 +19,10 @@ from .perception.depth_view import DepthView as DepthView
 from .planning import load_planner as load_planner
 from .planning import plan as plan
 from .planning.exploration.explorer import Explorer as Explorer
-from .planning.exploration.looks import NextView as NextView
-from .planning.exploration.looks import next_view as next_view
 from .planning.exploration.steps import ArmCamera as ArmCamera
 from .planning.exploration.steps import ExplorerSettings as ExplorerSettings
+from .planning.exploration.viewpoints import NextView as NextView
+from .planning.exploration.viewpoints import next_view as next_view
 from .planning.pipeline.waypoints import join as join
 from .planning.plan_many import plan_many as plan_many
 from .planning.reactive.replanner import Replanner as Replanner

@@ -19,7 +19,7 @@ ZONE = ((-0.36, -0.36, 0.0), (0.36, 0.36, 0.7))
 def recorded() -> tuple[rd.Problem, RecordedExplorer, list[Event]]:
     """A Panda explores its way from one side of a wall to the other, with at most two looks."""
     problem = rd.Problem(PANDA, rd.Scene([FLOOR, WALL]), HOME, BEYOND)
-    settings = ExplorerSettings(time_limit=1.0, look_attempts=2, max_looks=2)
+    settings = ExplorerSettings(time_limit=1.0, look_attempts=2, max_views=2)
     explorer = RecordedExplorer(PANDA, [wrist_camera(PANDA)], rd.Scene([FLOOR]), ZONE, settings)
     explorer.observe(camera_beside(problem, None, 0))
     return problem, explorer, list(explore(problem, explorer))

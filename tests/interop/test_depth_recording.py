@@ -26,7 +26,7 @@ PROBLEM = rd.Problem(PANDA, rd.Scene([FLOOR, WALL]), HOME, HOME + 0.2)
 
 
 def test_a_recorded_exploration_is_read_again_and_gives_the_same_voxels(tmp_path: Path) -> None:
-    settings = rd.ExplorerSettings(time_limit=1.0, max_looks=1)
+    settings = rd.ExplorerSettings(time_limit=1.0, max_views=1)
     explorer = RecordedExplorer(PANDA, [wrist_camera(PANDA)], rd.Scene([FLOOR]), settings=settings)
     explorer.observe(camera_beside(PROBLEM, None, 0))
     for _ in explore(PROBLEM, explorer):

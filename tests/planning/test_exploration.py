@@ -21,10 +21,10 @@ from robotdiffuse.perception.unknown_space import CARVING_MARGIN
 from robotdiffuse.perception.visibility import surface_balls
 from robotdiffuse.perception.voxel_grid import MAP
 from robotdiffuse.planning.exploration import simulated
-from robotdiffuse.planning.exploration.looks import ReachableTree, best_looks
 from robotdiffuse.planning.exploration.seen_free import GoalSeen, not_seen_free
 from robotdiffuse.planning.exploration.steps import DONE
 from robotdiffuse.planning.exploration.stopping import braked
+from robotdiffuse.planning.exploration.viewpoints import ReachableTree, best_viewpoints
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.trajectories.speed_limits import jerk_limits
 
@@ -40,7 +40,7 @@ def view() -> rd.DepthView:
 
 
 def explorer(policy: str = "strict", seen: bool = True, goal: Any = None, **more: Any) -> rd.Explorer:
-    settings = rd.ExplorerSettings(**{"policy": policy, "time_limit": 1.0, "look_attempts": 2, "max_looks": 2} | more)
+    settings = rd.ExplorerSettings(**{"policy": policy, "time_limit": 1.0, "look_attempts": 2, "max_views": 2} | more)
     out = rd.Explorer(PANDA, [simulated.wrist_camera(PANDA)], rd.Scene([FLOOR]), ZONE, settings)
     if seen:
         out.observe(view())
@@ -148,7 +148,7 @@ def test_looks_see_what_is_wanted() -> None:
     target = (np.array([77.5, 57.5, 42.5]) * MAP.edge) + MAP.low
     scene = rd.Scene([FLOOR])
     tree = ReachableTree(PANDA, scene, HOME)
-    looks = best_looks(one.map, tree, camera, wanted, None, np.random.default_rng(0))
+    looks = best_viewpoints(one.map, tree, camera, wanted, None, np.random.default_rng(0))
     best = list(islice(looks, 3))
     assert len(best) == 3
     for way in best:
@@ -161,7 +161,7 @@ def test_looks_see_what_is_wanted() -> None:
     goal_seen = GoalSeen(PANDA, one.map, ViewMemory(PANDA), False)
     goal_seen.observe(rd.DepthView(np.zeros((2, 2)), (1.0, 1.0, 0.5, 0.5), np.eye(4), best[0][-1]))
     [taken] = goal_seen.taken
-    other = next(best_looks(one.map, tree, camera, wanted, None, np.random.default_rng(0), [taken]))
+    other = next(best_viewpoints(one.map, tree, camera, wanted, None, np.random.default_rng(0), [taken]))
     assert np.abs(other[-1] - taken).max() > 0.05, "not from where an image did not show it"
 
 

@@ -11,7 +11,7 @@ from robotdiffuse.cli import main
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.perception.visibility import ARM_CELL, seen_weights
-from robotdiffuse.planning.exploration.looks import poses_around
+from robotdiffuse.planning.exploration.viewpoints import poses_around
 
 PANDA = load_robot("panda")
 START = np.array([-0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])

@@ -115,7 +115,7 @@ def test_a_browser_shows_the_steps(page: Path) -> None:
         toggles = shown.evaluate(names)
         pixels = shown.evaluate("layers.map((layer) => layer.meshes[0].geometry.index.count)")
     assert not errors and rows == ["false"] * (len(explorer.acts) - 1) + ["true"]
-    assert toggles[:5] == ["Occupied", "Predicted", "Unknown", "Next look", "True scene"]
+    assert toggles[:5] == ["Occupied", "Predicted", "Unknown", "Next view", "True scene"]
     assert np.array(pixels)[[0, 2]].min() > 6000
 
 

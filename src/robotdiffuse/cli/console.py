@@ -146,7 +146,9 @@ def print_result(result: "PlanResult", requested: float | None = None) -> None:
     if result.min_clearance is not None:
         rows.append(("clearance", f"certified {clearances(result, requested)}"))
     if result.trajectory is not None:
-        rows.append(("motion", f"{result.trajectory.duration:.2f} s, {len(result.trajectory.times)} rows"))
+        rows.append(
+            ("motion", f"{result.trajectory.duration:.2f} s, {len(result.trajectory.times)} time steps")
+        )
     rows.append(("seed", str(result.seed)))
     show(Table.pairs(f"{result.robot}: {result.status.value}", rows))
 
@@ -154,7 +156,7 @@ def print_result(result: "PlanResult", requested: float | None = None) -> None:
 def print_next_view(problem: "Problem", result: "PlanResult") -> None:
     """Print the proposed next camera pose in the form of problem files."""
     from robotdiffuse.core.transforms import pose_entry
-    from robotdiffuse.planning.exploration.looks import next_view
+    from robotdiffuse.planning.exploration.viewpoints import next_view
 
     proposed = next_view(problem, result)
     camera = ", ".join(

@@ -72,9 +72,10 @@ def explore_shelf(problem: Problem, outputs: list[Path]) -> int:
     problem = Problem(problem.robot, Scene([FLOOR, *obstacles]), start, problem.goal)
     print("The arm knows the floor. A camera at its tip and one beside it observe the rest.")
     explorer, arrived = simulate(problem, ExplorerSettings(time_limit=EXPLORE_TIME_LIMIT), None, 0)
-    looks = sum(act.step.kind == LOOK for act in explorer.acts)
+    views = sum(act.step.kind == LOOK for act in explorer.acts)
     end = "is at the goal" if arrived else "is not at the goal"
-    print(f"The arm {end}: {looks} looks, {len(explorer.views)} images, {explorer.duration:.1f} s in motion.")
+    images = len(explorer.views)
+    print(f"The arm {end}: {views} motions to viewpoints, {images} images, {explorer.duration:.1f} s.")
     for file in outputs:
         draw_exploration(explorer, problem, file)
         print(f"wrote {file.resolve()}")

@@ -1,7 +1,7 @@
 """Pictures and pages of an exploration: what was known about the scene over time, and the steps of the arm.
 
-The planner calls a step of an exploration an act (`RecordedAct`). A look is a step that moves the arm to take
-a view with its camera.
+The planner calls a step of an exploration an act (`RecordedAct`). A step of the kind `look` moves the arm to
+take a view with its camera.
 """
 
 from collections import Counter
@@ -45,7 +45,7 @@ LIKELY = 0.5
 UNKNOWN = (0x6E, 0x7B, 0x8C)
 """sRGB color of the boundary of unknown space."""
 LOOK_COLOR = (0xD9, 0x8A, 0x12)
-"""sRGB color of the camera's view pyramid at a look."""
+"""sRGB color of the camera's view pyramid at a viewpoint."""
 FRUSTUM_DEPTH = 0.25
 """Height of the view pyramid [m]."""
 READING_TIME = 1.5
@@ -140,7 +140,7 @@ def in_known_scene(explorer: RecordedExplorer) -> Voxels:
 
 
 def frustum(explorer: RecordedExplorer, act: RecordedAct) -> list[Points]:
-    """The edges of the view pyramid of the arm's first camera at the end of a look, as polylines in the base
+    """The edges of the view pyramid of the arm's first camera at a viewpoint, as polylines in the base
     frame [m]; an empty list for other steps."""
     if act.T_base_camera is None:
         return []
@@ -198,8 +198,8 @@ def write_exploration_picture(explorer: RecordedExplorer, scene: Scene, file: st
     """Write up to MAX_MOMENTS moments of an exploration as one .png, including the first and the last two.
 
     The picture of a moment shows the arm's motion and what was known when it was chosen: voxels seen occupied
-    (blue), predicted voxels (violet), the boundary of unknown space (gray, see-through), and for a look the
-    camera's view pyramid at its end. `scene` is the true scene; it is used only to choose the view.
+    (blue), predicted voxels (violet), the boundary of unknown space (gray, see-through), and for the kind
+    `look` the camera's view pyramid at its end. `scene` is the true scene; it is used only to choose the view.
     Raises InputError for a file name with another ending, or a file that cannot be written.
     """
     path = check_output(file, (".png",))
@@ -284,8 +284,8 @@ def write_exploration(explorer: RecordedExplorer, scene: Scene, file: str | File
     data["facts"] = [
         ("status", "solved" if last.kind == DONE else last.kind),
         ("policy", explorer.settings.policy.replace("_", " ")),
-        ("looks", str(kinds[LOOK])),
-        ("views", str(len(explorer.views))),
+        ("views by motions", str(kinds[LOOK])),
+        ("images", str(len(explorer.views))),
         ("time in motion", f"{explorer.duration:.1f} s"),
     ]
     write_atomically(target, page_text(f"{robot.name} · exploration", data, "exploration.js"))

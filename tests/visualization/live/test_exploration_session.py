@@ -21,7 +21,7 @@ from robotdiffuse.visualization.live.session import NO_MOTION, VALID
 
 PATIENCE = 300.0
 """[s]; a new machine compiles first."""
-SETTINGS = rd.ExplorerSettings(time_limit=20.0, look_attempts=2, max_looks=2)
+SETTINGS = rd.ExplorerSettings(time_limit=20.0, look_attempts=2, max_views=2)
 """A time limit so long that other work on the machine changes no step."""
 until = partial(waiting.state_when, patience=PATIENCE)
 

@@ -1,7 +1,7 @@
 """Explorer: takes an arm to goals through space that cameras see on the way.
 
-An Explorer returns steps. A *look* is a step that moves the arm to a viewpoint, where the caller takes an
-image. Motions follow one of two policies.
+An Explorer returns steps. Steps of the kind `look` move the arm to a viewpoint, where the caller takes
+an image. Motions follow one of two policies.
 
 **Strict.** The arm enters only voxels that were seen free: the validator accepts each motion among obstacles
 that cover all other space (`seen_free.py`). There are two exceptions: voxels with centers within 3 cm of the
@@ -16,9 +16,9 @@ camera pose within the error of that view's pose. Views from nearby can show thi
 first. The confidence follows from the predicted occupancy probabilities of the unknown voxels that the motion
 sweeps, except voxels that the arm fills at the start or at the end.
 
-To choose a look, the Explorer plans a tentative motion to the goal among only the seen obstacles. Looks
-should show the unseen space that this motion would sweep. The motion of a look is subject to the policy as
-well. Under the probabilistic policy, a strict motion to the viewpoint is tried first.
+To choose a viewpoint, the Explorer plans a tentative motion to the goal among only the seen obstacles. Views
+should show the unseen space that this motion would sweep. The motion to a viewpoint is subject to the policy
+as well. Under the probabilistic policy, a strict motion to the viewpoint is tried first.
 """
 
 from collections.abc import Iterable, Sequence
@@ -44,14 +44,6 @@ from robotdiffuse.perception.unknown_space import EXPLORED, UnknownSpace, lost_r
 from robotdiffuse.perception.voxel_grid import LAYERS_BELOW, MAP, Probabilities, Voxels, surface
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
-from robotdiffuse.planning.exploration.looks import (
-    CONFINED,
-    ReachableTree,
-    best_looks,
-    first_parts,
-    moved,
-    swept_unseen,
-)
 from robotdiffuse.planning.exploration.seen_free import (
     GoalSeen,
     cover,
@@ -74,6 +66,14 @@ from robotdiffuse.planning.exploration.steps import (
     Step,
 )
 from robotdiffuse.planning.exploration.stopping import Stop, stop_before
+from robotdiffuse.planning.exploration.viewpoints import (
+    CONFINED,
+    ReachableTree,
+    best_viewpoints,
+    first_parts,
+    moved,
+    swept_unseen,
+)
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.goals import Goal
@@ -87,10 +87,10 @@ PROBABILITY_BELOW = np.float32(0.1)
 unknown voxels within reach is occupied."""
 NOTHING, DEFAULTS = Scene(()), ExplorerSettings()
 QUICK_FRACTION = 0.2
-"""Fraction of the time limit that a search gets if a look or another search may follow. For searches within
-space seen free, it doubles with each look: the more space was seen, the likelier is a motion."""
+"""Fraction of the time limit that a search gets if a view or another search may follow. For searches within
+space seen free, it doubles with each view: the more space was seen, the likelier is a motion."""
 TENTATIVE_MOTIONS = 2
-"""Number of tentative motions among seen obstacles; looks are planned for the motion that sweeps the least
+"""Number of tentative motions among seen obstacles; views are planned for the motion that sweeps the least
 unseen space."""
 AT_GOAL = 1e-3
 """The arm is at a goal if every joint is within this of the goal [rad], [m] for prismatic joints."""
@@ -113,8 +113,8 @@ class Explorer:
         seed: int = 0,
     ) -> None:
         """
-        cameras: the cameras on the arm, with which looks are made. Views of other cameras can be observed
-            as well.
+        cameras: the cameras on the arm, for which motions to viewpoints are planned. Views of other cameras
+            can be observed as well.
         scene: shapes that are known without views, such as the floor.
         free_zone: low and high corner of a box [m] that counts as free unless a view finds something there,
             such as the space around the arm's base.
@@ -140,9 +140,9 @@ class Explorer:
         self._views = ViewMemory(robot)
         self._goal_seen = GoalSeen(robot, self.map, self._views, settings.see_goal)
         self._goal: Goal | None = None
-        self._looks = 0
+        self._views_taken = 0
         self._looked_for = np.zeros(MAP.shape, np.bool_)
-        """The voxels that looks since `set_goal` should have shown."""
+        """The voxels that views since `set_goal` should have shown."""
         self._way_in: Configurations | None = None
         """Waypoints of the latest motion that was returned."""
         self._news: list[DepthView] = []
@@ -164,7 +164,7 @@ class Explorer:
         """
         middle = 0.5 * (self.robot.lower + self.robot.upper)
         self._goal = Problem(self.robot, NOTHING, middle, goal).goal
-        self._looks = 0
+        self._views_taken = 0
         self._looked_for[:] = False
         self._goal_seen.forget()
 
@@ -235,14 +235,14 @@ class Explorer:
             step = replace(self._step(problem, policy), seen=problem.scene)
             if step.kind != STUCK:
                 break
-        self._looks += step.kind == LOOK
+        self._views_taken += step.kind == LOOK
         if step.motion is not None and step.motion.path is not None:
             self._way_in = step.motion.path.positions
         return step
 
     @locked
     def wanted(self, path: Path) -> Voxels:
-        """The voxels that looks should show.
+        """The voxels that views should show.
 
         They are the unknown voxels that a tentative motion sweeps and, if the goal must be seen, the unseen
         voxels at the arm's surface at the goal.
@@ -281,16 +281,16 @@ class Explorer:
                 return Step(STUCK, joint_goals.reason, policy)
             problem = replace(problem, goal=JointGoal(self._goal_seen.best(problem.start, joint_goals)[None]))
         predicted = self.predicted() if policy == PROBABILISTIC else None
-        may_look = bool(self.cameras) and self._looks < self.settings.max_looks
+        may_look = bool(self.cameras) and self._views_taken < self.settings.max_views
         limit = quick = self.settings.time_limit
-        if may_look and policy == STRICT:  # a short search; a look may show more free space
-            quick = min(self._quick_limit * 2**self._looks, limit)
+        if may_look and policy == STRICT:  # a short search; a view may show more free space
+            quick = min(self._quick_limit * 2**self._views_taken, limit)
         motion = self._motion(problem, policy, predicted, quick, may_look)
         if self._may_go(motion, policy):
             return self._go(motion, policy)
         look = self._look(problem, policy, predicted, motion)
         skipped = policy == STRICT and motion.status is Status.NO_PATH
-        # without a look, search for the whole time limit, even if too little was seen free
+        # without a view, search for the whole time limit, even if too little was seen free
         if look.kind == STUCK and (quick < limit or skipped):
             motion = self._motion(problem, policy, predicted, limit)
             if self._may_go(motion, policy):
@@ -335,8 +335,8 @@ class Explorer:
                 )
         if not self.cameras:
             return Step(STUCK, f"{why}; no camera is on the arm to look with", policy)
-        if self._looks >= self.settings.max_looks:
-            return Step(STUCK, f"{why}, after {self._looks} looks", policy)
+        if self._views_taken >= self.settings.max_views:
+            return Step(STUCK, f"{why}, after {self._views_taken} views", policy)
         path = motion.path
         tentative, to_view = self._least_unseen(problem) if path is None else (motion, self.wanted(path))
         if tentative.path is None:
@@ -351,7 +351,7 @@ class Explorer:
         if safe_motion is not None and self._may_go(safe_motion, safe_policy):
             return self._go(safe_motion, safe_policy)
         predicted = self.predicted() if predicted is None else predicted
-        # the motion of a look is through space seen free if possible, under both policies
+        # the motion to a viewpoint is through space seen free if possible, under both policies
         policies = (STRICT, PROBABILISTIC) if self.settings.policy == PROBABILISTIC else (policy,)
         for look_policy in policies:
             look = self._way_to_look(problem, look_policy, to_view, predicted)
@@ -363,7 +363,7 @@ class Explorer:
         back = self._way_back(problem) if STRICT in policies else None
         if back is not None:
             return Step(LOOK, f"{why}; go back on the way in and look from there", STRICT, back)
-        return Step(STUCK, f"{why}; no look that would help can be reached", policy)
+        return Step(STUCK, f"{why}; no viewpoint that would help can be reached", policy)
 
     def _way_to_look(
         self,
@@ -382,7 +382,7 @@ class Explorer:
         taken = self._goal_seen.taken
         for camera in self.cameras:
             arguments = wanted, predicted, self._rng, taken, hemmed_in, self._beside
-            paths = best_looks(self.map, tree, camera, *arguments)
+            paths = best_viewpoints(self.map, tree, camera, *arguments)
             for waypoints in islice(paths, self.settings.look_attempts):
                 if policy == STRICT:
                     motion = self._along(allowed, waypoints, "look")
@@ -438,10 +438,10 @@ class Explorer:
         return PlanningContext(self._planner.name, problem, PlanRequest(limit, seed, FIRST))
 
     def _least_unseen(self, as_seen: Problem) -> tuple[PlanResult, Voxels]:
-        """A motion among seen obstacles, and the unseen voxels on it that looks should show.
+        """A motion among seen obstacles, and the unseen voxels on it that views should show.
 
         Several motions are planned; the one that sweeps the least unseen space is returned, or a failed
-        result if none was found. If possible, motions avoid occupied voxels, and voxels that earlier looks
+        result if none was found. If possible, motions avoid occupied voxels, and voxels that earlier views
         failed to show.
         """
         goals = as_seen.goal.positions if isinstance(as_seen.goal, JointGoal) else ()
@@ -544,7 +544,7 @@ class Explorer:
         """The goal configurations, or the result that says why there is none."""
         if isinstance(problem.goal, JointGoal):
             return problem.goal.positions
-        # with see_goal, a constant seed gives the same goals at each step, so that looks add up
+        # with see_goal, a constant seed gives the same goals at each step, so that views add up
         seed = 0 if self.settings.see_goal else self._seed
         usable = usable_start_goal(self._context(problem, self.settings.time_limit, seed))
         return usable if isinstance(usable, PlanResult) else np.stack(usable.goals)

@@ -72,8 +72,8 @@ class ExplorerSettings(Settings, name="explorer"):
     """Minimum stated confidence of motions under the probabilistic policy."""
     time_limit: Positive = 1.0
     """Time limit of each search [s]."""
-    max_looks: Natural = 8
-    """Maximum number of looks (motions to a viewpoint, with an image there) on the way to a goal."""
+    max_views: Natural = 8
+    """Maximum number of views that the arm moves to take on the way to a goal."""
     look_attempts: Count = 4
     """For each camera, a step tries to plan a motion to at most this many viewpoints, the best first."""
     predict: bool = True
@@ -114,6 +114,6 @@ class Step:
     """The known scene and the points of the views that the Explorer still uses; None if nothing was
     planned."""
     wanted: Voxels | None = None
-    """The voxels that a look should show: voxels that no view saw and that the arm would pass through on a
-    motion to the goal, planned as if unseen space were free, or would fill at the goal. None for other
+    """The voxels that the next view should show: voxels that no view saw and that the arm would pass through
+    on a motion to the goal, planned as if unseen space were free, or would fill at the goal. None for other
     steps."""

@@ -1,8 +1,8 @@
 """A live exploration: its session, and the page that shows it in browsers.
 
 A thread of the session chooses steps and executes them at the speed of the motion. Visitors can pause, step,
-restart and change the options. The planner calls a step an act (`RecordedAct`); a look is a step that moves
-the arm to take a view.
+restart and change the options. The planner calls a step an act (`RecordedAct`); the kind `look`
+moves the arm to take a view.
 """
 
 import html
@@ -85,7 +85,7 @@ PAUSED = "paused"
 STEPPING = "stepping"
 RUNNING = "running"
 CLEAR_OPACITY = 0.6
-"""Opacity of predicted voxels, and of the unknown voxels that a look shall observe."""
+"""Opacity of predicted voxels, and of the unknown voxels that the next view should show."""
 UNKNOWN_OPACITY = 0.2
 """Opacity of the boundary of unknown space."""
 # length of the pyramid that stands for the camera on the arm [m], and its color
@@ -393,7 +393,7 @@ class ExplorationPage(LivePage):
                 add_surface(self.server, f"/{name}", surface, color, opacity)
 
     def _show_act(self, explorer: RecordedExplorer, act: RecordedAct | None) -> None:
-        """Show the trace of a step's motion and, for a look, the arm at its end and the view pyramid
+        """Show the trace of a step's motion and, for the kind `look`, the arm at its end and the view pyramid
         there."""
         draw_trace(self.server, self._drawn, None if act is None else act.trajectory)
         look = act if act is not None and act.step.kind == LOOK else None

@@ -128,7 +128,7 @@ const addToggle = (name, objects, rgb) => {
   $("toggles").insertBefore(button, first);
 };
 recording.layers.forEach((layer, l) => addToggle(layer.name, [layers[l].group], layer.color));
-addToggle("Next look", [new THREE.Group()], recording.look_color);
+addToggle("Next view", [new THREE.Group()], recording.look_color);
 const lookToggle = $("toggles").children[recording.layers.length];
 addToggle("True scene", [trueScene]);
 

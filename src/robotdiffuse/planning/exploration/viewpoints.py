@@ -131,7 +131,7 @@ def swept_unseen(known: OccupancyMap, path: Path) -> Voxels:
     return swept & ~MAP.filled(known.robot, path.positions[-1:], CARVING_MARGIN)
 
 
-def best_looks(
+def best_viewpoints(
     known: OccupancyMap,
     tree: ReachableTree,
     camera: ArmCamera,
