@@ -1,11 +1,16 @@
-"""Each example runs, solves its problem and writes its picture, which the gallery shows; public functions document their
-parameters in Google's style, and their examples run."""
+"""Each example runs, solves its problem and writes its picture, which the gallery shows; public functions and the classes of
+docs/reference/modules.md document their parameters and results in Google's style, and examples of public names run."""
 
+import dataclasses
 import doctest
 import inspect
+import re
 import runpy
+import shutil
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import griffe
 import numpy as np
@@ -13,6 +18,8 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.quick_preparation import QUICK, coarse_grids
+from robotdiffuse.core.settings import field_docstrings
+from robotdiffuse.interop.depth_recording import StampedView, write_depth_views
 from robotdiffuse.robots.fitting.preparation import add_robot
 
 ROOT = Path(__file__).parents[2]
@@ -51,45 +58,85 @@ def test_the_first_motion_of_the_readme_keeps_the_asked_clearance() -> None:
 
 
 NAMES = sorted(getattr(rd, "__all__"))  # noqa: B009  (the stub does not name it)
+MODULES = re.findall(r"^::: robotdiffuse\.(.+)$", (ROOT / "docs" / "reference" / "modules.md").read_text("utf-8"), re.MULTILINE)
 
 
-def public_functions(name: str) -> Iterator[Callable[..., object]]:
-    """The function with a public name, or the public methods that a class defines itself."""
-    value = getattr(rd, name)
+def public(name: str) -> Any:
+    """A name of `rd`, or the object at a dotted place in the package."""
+    module, dot, attribute = name.rpartition(".")
+    return getattr(import_module(f"robotdiffuse.{module}") if dot else rd, attribute)
+
+
+def public_functions(value: Any) -> Iterator[Callable[..., Any]]:
+    """A function, or the public methods and the constructor that a class defines itself."""
     if inspect.isfunction(value):
         yield value
     if inspect.isclass(value):
         for own, member in list(vars(value).items()):  # copying adds to it
-            function = getattr(member, "__func__", member)
-            if inspect.isfunction(function) and not own.startswith("_"):
-                yield inspect.unwrap(function)
+            function = inspect.unwrap(getattr(member, "__func__", member))
+            if not inspect.isfunction(function) or (own.startswith("_") and own != "__init__"):
+                continue
+            if function.__code__.co_filename == inspect.getsourcefile(value):  # dataclasses generate constructors
+                yield function
 
 
-def parameters(function: Callable[..., object]) -> set[str]:
+def parameters(function: Callable[..., Any]) -> set[str]:
     return {name for name in inspect.signature(function).parameters if name not in ("self", "cls")}
 
 
-def documented(function: Callable[..., object]) -> set[str]:
-    """Names below `Args:`, as griffe reads them for the reference."""
-    sections = griffe.Docstring(inspect.getdoc(function) or "").parse("google", warnings=False)
-    return {
-        argument.name.lstrip("*")
-        for section in sections
-        if section.kind is griffe.DocstringSectionKind.parameters
-        for argument in section.value
-    }
+def sections(of: Any) -> dict[str, Any]:
+    """Sections of a docstring by kind, as mkdocs.yml makes griffe read them for the reference."""
+    docstring = griffe.Docstring(inspect.getdoc(of) or "")
+    parsed = docstring.parse("google", warnings=False, returns_multiple_items=False, returns_named_value=False)
+    return {section.kind.value: section.value for section in parsed}
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_every_parameter_is_documented(name: str) -> None:
-    for function in public_functions(name):
+def documented(of: Any) -> set[str]:
+    """Names below `Args:`."""
+    return {argument.name.lstrip("*") for argument in sections(of).get("parameters", ())}
+
+
+@pytest.mark.parametrize("name", [*NAMES, *MODULES])
+def test_parameters_and_results_are_documented(name: str) -> None:
+    for function in public_functions(public(name)):
         assert inspect.getdoc(function), function.__qualname__
         assert documented(function) == parameters(function), function.__qualname__
+        if inspect.signature(function).return_annotation not in (None, "None"):
+            [returned] = sections(function).get("returns", ())
+            assert returned.annotation is None, f"{function.__qualname__}: a colon makes {returned.annotation!r} a type"
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_examples_run(name: str) -> None:
+def test_fields_are_documented(name: str) -> None:
+    """By a docstring below each, or below `Args:` of the class."""
+    value = public(name)
+    if dataclasses.is_dataclass(value):
+        fields = {field.name for field in dataclasses.fields(value) if field.init}
+        args = documented(value)
+        assert args <= fields and fields <= {*args, *field_docstrings(value)}, name  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where examples run: with the folder `examples`, and a recording of a camera."""
+    folder = tmp_path_factory.mktemp("docstrings")
+    shutil.copytree(ROOT / "examples", folder / "examples")
+    robot = rd.load_robot("panda")
+    ready = rd.Problem(robot, rd.Scene(), "ready", "ready").start
+    view = rd.DepthView(np.full((48, 64), 1.4), [50, 50, 31.5, 23.5], rd.pose([1.5, 0, 0.5]), ready)
+    write_depth_views(robot, {"camera": [StampedView(stamp, view) for stamp in (0.0, 0.5)]}, folder / "recording.mcap")
+    return folder
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_examples_run(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
     finder = doctest.DocTestFinder(recurse=False)
-    for function in public_functions(name):
-        for example in finder.find(function, function.__qualname__, globs={"rd": rd, "np": np}):
-            assert doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example).failed == 0, function.__qualname__
+    value = public(name)
+    tried = 0
+    for of in dict.fromkeys([value, *public_functions(value)]):
+        for example in finder.find(of, getattr(of, "__qualname__", name), globs={"rd": rd, "np": np}):
+            tried += len(example.examples)
+            assert doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example).failed == 0, example.name
+    untried = "Example:\n" in (inspect.getdoc(value) or "")  # needs a notebook, or real images
+    assert tried or untried or not inspect.isfunction(value), f"{name} has no example"

@@ -68,8 +68,17 @@ def load_certificate(file: str | FilePath) -> Certificate:
     Args:
         file: A file that `Certificate.save` or `robotdiffuse verify --certificate` wrote.
 
+    Returns:
+        The motion and its proof, which is not checked yet.
+
     Raises:
         InputError: For a file that cannot be read, and for one that is not a valid certificate file.
+
+    Examples:
+        >>> problem = rd.Problem(rd.load_robot("panda"), rd.Scene(), "ready", "extended")
+        >>> rd.certify(problem, rd.plan(problem, until="first").path).save("proof.json")
+        >>> rd.load_certificate("proof.json").check(problem).valid
+        True
     """
     record = read_json(file)
     if not is_certificate(record):

@@ -95,6 +95,7 @@ class MotionProof:
     """A motion, what was proved of it, and the proof."""
 
     robot: str
+    """Name of the robot."""
     robot_parts: dict[str, str]
     """Content hashes of the robot's parts, by name."""
     scene_parts: dict[str, str]
@@ -102,7 +103,9 @@ class MotionProof:
     motion_hash: str
     """Hash of the motion, without any rounding."""
     tolerances: Tolerances
+    """The tolerances that the proof uses."""
     motion: Path | Trajectory
+    """The motion."""
     between: Values
     """Places between the rows at which the proof has further configurations: times on the cubics between rows
     [s]; for a path, the index of a row plus the fraction of the way to the next row."""
@@ -112,6 +115,7 @@ class MotionProof:
     """Lower bound on the distance between links that are checked against each other, along the whole motion
     [m]."""
     proof: StretchProof
+    """That the arm is free of the scene and of itself."""
     problem: dict[str, Any] | None = None
     """The problem as in a problem file; None if the robot cannot be loaded by a name or file."""
     request_parts: dict[str, str] = field(default_factory=dict)

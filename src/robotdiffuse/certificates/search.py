@@ -196,10 +196,19 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         motion: A path, or a trajectory.
         settings: Tolerances of the validator.
 
+    Returns:
+        The motion and its proof; `Certificate.check` checks it.
+
     Raises:
         NotValidError: If the validator refuses the motion; a subclass of InputError that names the violation.
         InputError: For obstacles and requirements that certificates do not support, and if no proof of
             reasonable size is found.
+
+    Examples:
+        >>> problem = rd.Problem(rd.load_robot("panda"), rd.Scene(), "ready", "extended")
+        >>> result = rd.plan(problem, until="first")
+        >>> rd.certify(problem, result.trajectory).check(problem).valid
+        True
     """
     report = verify(problem, motion, settings)
     if problem.moving and isinstance(motion, Path):

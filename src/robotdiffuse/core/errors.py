@@ -20,11 +20,16 @@ MAX_NAMES = 100
 class InputError(ValueError):
     """Bad input. The message is one line that names the field, its value and what would be right.
 
-    Each entry of `listed` is a further, indented line of the message. The command line prints the message and
-    exits with status 2.
+    The command line prints the message and exits with status 2.
     """
 
     def __init__(self, message: str = "", listed: Iterable[str] = ()) -> None:
+        """Put the message on one line, with words of at most 300 characters.
+
+        Args:
+            message: The field, its value and what would be right.
+            listed: Further lines of the message, which are indented.
+        """
         words = _printable(message).split()
         line = " ".join(shortened(word) if len(word) > MAX_WORD else word for word in words)
         super().__init__("\n  ".join([line, *listed]))

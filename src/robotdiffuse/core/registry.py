@@ -74,11 +74,13 @@ class Registry(dict[str, Entry]):
     """
 
     def __init__(self, what: str, entries: dict[str, Entry], group: str = "") -> None:
-        """
-        what: the kind of entry in error messages, e.g. "planner".
-        entries: the package's own entries.
-        group: the group of entry points, e.g. "robotdiffuse.planners", in which an installed package may name
-            an Entry; empty if packages cannot add entries.
+        """Make a table of the package's own entries, and of those that a parent process added.
+
+        Args:
+            what: The kind of entry in error messages, e.g. "planner".
+            entries: The package's own entries by name.
+            group: The group of entry points, e.g. "robotdiffuse.planners", in which an installed package may
+                name an Entry; empty if packages cannot add entries.
         """
         super().__init__(entries | _adopted.get(what, {}))
         self.what = what
@@ -114,24 +116,61 @@ class Registry(dict[str, Entry]):
         return entry
 
     def load_installed(self) -> "Registry":
-        """The registry with the entries of all installed packages, for listing."""
+        """Load the entries of all installed packages, for listing.
+
+        Returns:
+            This registry.
+
+        Raises:
+            InputError: For an entry point that cannot be loaded.
+        """
         for name in self._installed:
             self[name]
         return self
 
     def entry(self, name: object) -> Entry:
-        """The entry of a name. Raises InputError, listing the known names, for an unknown one."""
+        """Look up an entry.
+
+        Args:
+            name: Its name.
+
+        Returns:
+            The entry, without importing what it names.
+
+        Raises:
+            InputError: For an unknown name; the message lists the known ones.
+        """
         if not isinstance(name, str) or name not in self:
             raise unknown_name(self.what, name, {*self, *self._installed})
         return self[name]
 
     def load(self, name: str) -> Any:
-        """Import the class, function or value of an entry. Raises InputError as `entry` does."""
+        """Import what an entry names.
+
+        Args:
+            name: Name of the entry.
+
+        Returns:
+            The class, function or value at the entry's location.
+
+        Raises:
+            InputError: For an unknown name.
+        """
         module, _, attribute = self.entry(name).location.partition(":")
         return getattr(import_module(module), attribute)
 
     def settings(self, name: str) -> type | None:
-        """The settings class of an entry; None if it has none. Raises InputError as `entry` does."""
+        """Import the settings class of an entry.
+
+        Args:
+            name: Name of the entry.
+
+        Returns:
+            The class; None if the entry has no settings.
+
+        Raises:
+            InputError: For an unknown name.
+        """
         entry = self.entry(name)
         if not entry.settings:
             return None
@@ -140,14 +179,32 @@ class Registry(dict[str, Entry]):
         return getattr(import_module(module or entry_module), attribute)
 
     def defaults(self, name: str) -> Any:
-        """The default settings of an entry; None if it has none."""
+        """Make the default settings of an entry.
+
+        Args:
+            name: Name of the entry.
+
+        Returns:
+            A new settings object; None if the entry has no settings.
+
+        Raises:
+            InputError: For an unknown name.
+        """
         kind = self.settings(name)
         return None if kind is None else kind()
 
     def make(self, name: str, settings: object | None = None) -> Any:
-        """A new instance of the entry's class, with default settings if none are given.
+        """Make an instance of an entry's class.
 
-        Raises InputError for an unknown name and for settings of another class.
+        Args:
+            name: Name of the entry.
+            settings: An object of the entry's settings class; None: the defaults.
+
+        Returns:
+            The new instance.
+
+        Raises:
+            InputError: For an unknown name, and for settings of another class.
         """
         kind = self.load(name)
         if settings is None:

@@ -38,19 +38,25 @@ class PlanResult:
     """
 
     status: Status
+    """How the call ended."""
     reason: str
     """A sentence: if SOLVED, which part of the planner found the path; otherwise why there is no motion, and
     what to do."""
     planner: str
+    """Name of the planner."""
     robot: str
+    """Name of the robot."""
     planning_time: float
     """Wall time of plan() until the returned path is validated [s], without loading time; the path's final
     time parameterization follows and does not count."""
     seed: int
+    """Seed of the random numbers."""
     stage: str = ""
     """The part of the planner that produced the path, e.g. 'aorrtc', 'straight_line', 'network'."""
     path: Path | Any = None
+    """Waypoints from the start to a goal."""
     trajectory: Trajectory | Any = None
+    """The timed motion along the path."""
     min_clearance: float | Any = None
     """Lower bound on all distances along the motion [m]: the smaller of `scene_clearance` and
     `self_clearance`."""
@@ -144,10 +150,13 @@ class PlanResult:
             self.trajectory.save(path)
 
     def record(self, problem: dict[str, Any] | None = None) -> dict[str, Any]:
-        """The content of a result file, as JSON values.
+        """Convert the result to JSON values.
 
         Args:
             problem: The content of a problem file, to include.
+
+        Returns:
+            The content of a result file.
         """
         path = self.path
         record: dict[str, Any] = {"status": self.status.value}
@@ -182,9 +191,18 @@ def load_result(file: str | FilePath) -> ResultFile:
     Args:
         file: A .json file that `PlanResult.save` or `robotdiffuse plan --out` wrote.
 
+    Returns:
+        The result, and the content of its problem file if that was saved too.
+
     Raises:
         InputError: For a file that cannot be read, and for fields that are missing, of the wrong shape or not
             finite.
+
+    Examples:
+        >>> problem = rd.Problem(rd.load_robot("panda"), rd.Scene(), "ready", "extended")
+        >>> rd.plan(problem, until="first").save("result.json")
+        >>> rd.load_result("result.json").result.status.value
+        'solved'
     """
     planned = f"it is a problem; `robotdiffuse plan {file} --out result.json` makes a result of it"
     if FilePath(str(file)).suffix.lower() in PROBLEM_ENDINGS:

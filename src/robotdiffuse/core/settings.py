@@ -172,15 +172,26 @@ class Settings:
             object.__setattr__(self, name, converted(prefix + name, hint, getattr(self, name), self))
 
     def to_json(self) -> dict[str, Any]:
-        """All fields as plain JSON values."""
+        """Convert the settings to plain JSON values.
+
+        Returns:
+            All fields by name; nested settings are dicts too.
+        """
         return dataclasses.asdict(self)  # type: ignore[call-overload]
 
     @classmethod
     def from_json(cls: type[Given], values: object, where: str) -> Given:
-        """The settings from the values that `to_json` returned.
+        """Make settings of the values that `to_json` returned.
 
-        Raises InputError, naming `where` and the field, for a field that is unknown, missing, of the wrong
-        type or out of bounds.
+        Args:
+            values: The fields by name; fields that have a default may be missing.
+            where: What the values are, for messages, e.g. "settings".
+
+        Returns:
+            The checked settings.
+
+        Raises:
+            InputError: For a field that is unknown, missing, of the wrong type or out of bounds.
         """
         if not isinstance(values, dict):
             raise InputError(f"{where} is {shown(values)}; it must be a table of settings")
@@ -206,10 +217,17 @@ class Settings:
         return cls(**checked)
 
     def changed(self: Given, assignments: Iterable[str]) -> Given:
-        """A copy with some settings replaced: "step=0.5", "guidance.margin=0.02"; values as in YAML.
+        """Replace some settings, given as on the command line.
 
-        Raises InputError for text that is not NAME=VALUE, an unknown name (the message lists all settings)
-        and a value of the wrong type or out of bounds.
+        Args:
+            assignments: Texts such as "step=0.5" and "guidance.margin=0.02", with values as in YAML.
+
+        Returns:
+            A copy with these values.
+
+        Raises:
+            InputError: For text that is not NAME=VALUE, an unknown name (the message lists all settings), and
+                a value of the wrong type or out of bounds.
         """
         owner = self.settings_name or type(self).__name__
         valid_assignments = ", ".join(setting.assignment for setting in self.describe())
@@ -229,10 +247,17 @@ class Settings:
         return self.replaced(values)
 
     def replaced(self: Given, values: Mapping[str, Any]) -> Given:
-        """A copy with some settings replaced: {"step": 0.5, "guidance.margin": 0.02}, or with nested settings
-        as a table, {"guidance": {"margin": 0.02}}.
+        """Replace some settings.
 
-        Raises InputError as `changed` does.
+        Args:
+            values: New values by name, such as {"step": 0.5, "guidance.margin": 0.02}, or with nested
+                settings as a table, {"guidance": {"margin": 0.02}}.
+
+        Returns:
+            A copy with these values.
+
+        Raises:
+            InputError: For an unknown name, and a value of the wrong type or out of bounds.
         """
         assignments = [setting.assignment for setting in self.describe()]
         return self._replaced(values, self.settings_name, assignments)
@@ -258,7 +283,11 @@ class Settings:
         return dataclasses.replace(self, **replaced)  # type: ignore[type-var]
 
     def describe(self) -> list[Setting]:
-        """All settings with their values, including nested ones."""
+        """List the settings.
+
+        Returns:
+            Name, value, allowed values and description of each setting; nested ones have dotted names.
+        """
         hints = _hints(type(self))
         documents = field_docstrings(type(self))
         settings: list[Setting] = []

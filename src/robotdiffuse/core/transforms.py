@@ -100,7 +100,7 @@ def transform(xyz: Vector, rotation: Rotation | None = None) -> Pose:
 
 
 def pose(xyz: ArrayLike, *, wxyz: ArrayLike | None = None, rpy: ArrayLike | None = None) -> Pose:
-    """The 4 x 4 matrix of a position and a rotation, as goals, bases, tools and cameras take it.
+    """A rigid transform from a position and a rotation, as goals, bases, tools and cameras take it.
 
     Args:
         xyz: Position [m].
@@ -108,8 +108,15 @@ def pose(xyz: ArrayLike, *, wxyz: ArrayLike | None = None, rpy: ArrayLike | None
         rpy: Rotation as roll, pitch and yaw in the order of URDFs [rad]. Without wxyz and rpy, the rotation
             is the identity.
 
+    Returns:
+        The homogeneous transform [4, 4].
+
     Raises:
         InputError: If wxyz and rpy are given, and for anything but finite numbers.
+
+    Examples:
+        >>> rd.pose([0.5, 0, 0.3], rpy=[0, 0, np.pi / 2])[0].round(3).tolist()
+        [0.0, -1.0, 0.0, 0.5]
     """
     if wxyz is not None and rpy is not None:
         raise InputError("pose has wxyz and rpy; give one of them")

@@ -121,8 +121,9 @@ class Path(Value):
     """Waypoints joined by straight segments in joint space."""
 
     joint_names: tuple[str, ...]
+    """Names of the planned joints, one for each column."""
     positions: Float[ndarray, "n dof"]
-    """[rad], [m] for prismatic joints."""
+    """The waypoints [rad], [m] for prismatic joints."""
 
     def __repr__(self) -> str:
         if getattr(self.positions, "ndim", 0) != 2:  # a Path is validated on use, not when it is made
@@ -166,11 +167,15 @@ class Trajectory(Value):
     """
 
     joint_names: tuple[str, ...]
+    """Names of the planned joints, one for each column."""
     times: Float[ndarray, "n"]
     """[s], starting at 0, strictly increasing."""
     positions: Float[ndarray, "n dof"]
+    """[rad], [m] for prismatic joints."""
     velocities: Float[ndarray, "n dof"]
+    """[rad/s] or [m/s]."""
     accelerations: Float[ndarray, "n dof"]
+    """[rad/s²] or [m/s²]."""
 
     def __repr__(self) -> str:
         if not isinstance(self.times, ndarray) or self.times.ndim != 1 or not self.times.size:
@@ -204,14 +209,17 @@ class Trajectory(Value):
         return np.where((self.accelerations[[0, -1]] == 0).all(axis=0), between, np.inf)
 
     def at(self, time: float | int | Float[ndarray, "n"]) -> State:
-        """The state at one time or at several times.
+        """Interpolate the motion at one time or at several times.
 
         Positions and velocities are those of the cubics between rows. Accelerations are linear between rows,
         and jerks are their slopes; at a row, the jerk is that of the step after the row. A trajectory of one
-        row is returned as that row with zero jerk.
+        row has zero jerk.
 
         Args:
             time: Time, or times [n], from 0 to the duration [s].
+
+        Returns:
+            Positions, velocities, accelerations and jerks, each [dof], or [n, dof] for several times.
 
         Raises:
             InputError: For a time outside of the motion.
@@ -248,7 +256,7 @@ class Trajectory(Value):
         return (6 * mean - 4 * v[:-1] - 2 * v[1:]) / steps, (2 * v[:-1] + 4 * v[1:] - 6 * mean) / steps
 
     def resample(self, rate: float | int) -> "Trajectory":
-        """The motion with rows 1 / rate apart, and a last row at its end.
+        """Sample the motion at a constant rate, with a last row at its end.
 
         With fewer rows, the cubics between the rows may need larger accelerations where the acceleration
         changes quickly. A motion from rest to rest is then averaged: its rows lie on the uniform cubic
@@ -258,6 +266,9 @@ class Trajectory(Value):
 
         Args:
             rate: Rows in a second [Hz], above 0 and at most 100,000.
+
+        Returns:
+            The motion with rows 1 / rate apart.
 
         Raises:
             InputError: For another rate.
@@ -301,7 +312,11 @@ class Trajectory(Value):
             write_atomically(path, self._csv())
 
     def record(self) -> dict[str, Any]:
-        """The trajectory as JSON values."""
+        """Convert the trajectory to JSON values.
+
+        Returns:
+            `joint_names`, `times`, and the rows of positions, velocities and accelerations.
+        """
         rows = {name: getattr(self, name).tolist() for name in ("times", *ROWS)}
         return {"joint_names": list(self.joint_names)} | rows
 

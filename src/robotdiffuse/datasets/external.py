@@ -91,6 +91,12 @@ def write_dataset(
     Raises:
         InputError: For joint values of the wrong shape or out of limits, obstacles that are no spheres or
             boxes, a folder that holds data, and if no scene falls into the training split.
+
+    Examples:
+        >>> start, goal = [0, -0.8, 0, -2.4, 0, 1.6, 0.8], [0.5, -0.2, 0, -2, 0, 1.8, 0.8]
+        >>> scenes = [rd.Scene([rd.Sphere([0.5, -0.5, z], 0.1)]) for z in (0.3, 0.6, 0.9)]
+        >>> rd.write_dataset([[start, goal]] * 3, scenes, "own", "panda", waypoints=48)
+        3
     """
     arm = robot if isinstance(robot, Robot) else load_robot(robot)
     if waypoints < 2:

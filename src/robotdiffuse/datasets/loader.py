@@ -152,7 +152,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
     def batches(
         self, batch_size: int, shuffle: bool = True, generator: torch.Generator | None = None
     ) -> Iterator[RopBatch]:
-        """One epoch of batches, prefetched by as many threads as PyTorch uses, at most MAX_THREADS.
+        """Read one epoch of batches, prefetched by as many threads as PyTorch uses, at most 8.
 
         Rows are shuffled within blocks of 16 shards, and shards among blocks, so that reads are local.
 
@@ -162,6 +162,12 @@ class RopDataset(Dataset[dict[str, Tensor]]):
             generator: CPU generator of the order and the clouds; the same state gives the same batches for
                 any number of threads. None: a new generator from `seed`, so that every call gives the same
                 epoch.
+
+        Returns:
+            An iterator over the batches.
+
+        Raises:
+            InputError: For a batch size below 1.
         """
         if batch_size < 1:
             raise InputError(f"batch_size is {batch_size}; it must be at least 1")

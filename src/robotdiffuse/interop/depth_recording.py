@@ -145,9 +145,18 @@ def read_depth_views(
         T_base_camera: The pose of a fixed camera [4, 4], in place of the file's transforms. Views of a file
             without joint states then have no configuration.
 
+    Returns:
+        An iterator over the views, each with the stamp of its image [s].
+
     Raises:
         InputError: For a file that is damaged or holds no depth images, if no image has joint states and
             transforms within 0.1 s, and for distorted or compressed images.
+
+    Examples:
+        >>> for stamp, view in rd.read_depth_views("recording.mcap", rd.load_robot("panda")):
+        ...     print(f"{stamp:.1f} s: {view.depth.shape}")
+        0.0 s: (48, 64)
+        0.5 s: (48, 64)
     """
     path = file_name(file)
     check_type("robot", robot, Robot, "a Robot, e.g. rd.load_robot('panda')")

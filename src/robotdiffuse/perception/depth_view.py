@@ -53,8 +53,10 @@ class DepthView(Value):
     """A depth image of a pinhole camera, in the frame of the robot's base.
 
     A pixel without a return (0, negative or not a number) says nothing: its ray may be free or occupied. A
-    pixel of +inf, or above 1e4, means that nothing is within the camera's range (as in ROS, REP 117). Raises
-    InputError for arrays of the wrong shape and for matrices that are not poses.
+    pixel of +inf, or above 1e4, means that nothing is within the camera's range (as in ROS, REP 117).
+
+    Raises:
+        InputError: For arrays of the wrong shape, and for matrices that are not poses.
     """
 
     depth: Float32[ndarray, "h w"]
@@ -130,8 +132,12 @@ class DepthView(Value):
         ) -> None: ...
 
     def points(self) -> Points:
-        """The points in the base frame [m]: the original cloud, or a point for each pixel with a return, row
-        by row."""
+        """Compute the points that the camera saw.
+
+        Returns:
+            Points [n, 3] in the base frame [m]; the original cloud, or a point for each pixel with a return,
+            row by row.
+        """
         if self.cloud is not None:
             return self.cloud
         v, u = np.nonzero(np.isfinite(self.depth) & (self.depth > 0))
@@ -141,10 +147,13 @@ class DepthView(Value):
         return placed(self.T_base_camera, in_camera)
 
     def moved(self, T: Pose) -> "DepthView":
-        """The view after a rigid motion of its camera and its points.
+        """Move the camera and the points.
 
         Args:
             T: The rigid motion, a homogeneous transform [4, 4].
+
+        Returns:
+            The view after the motion.
         """
         cloud = None if self.cloud is None else placed(T, self.cloud)
         return replace(self, T_base_camera=T @ self.T_base_camera, cloud=cloud)
@@ -157,7 +166,7 @@ class DepthView(Value):
         configuration: Configuration | None = None,
         source: dict[str, str | float] | None = None,
     ) -> "DepthView":
-        """The depth image that a camera would take of a point cloud.
+        """Make the depth image that a camera would take of a point cloud.
 
         Each pixel holds its nearest point. The image covers the cloud, and its pixels are large enough that
         most of them contain points. Points behind the camera are ignored.
@@ -168,6 +177,9 @@ class DepthView(Value):
             configuration: Configuration of the arm when the cloud was recorded, to remove the arm's own
                 points; None: the start of the problem.
             source: The file of the cloud, for problem files.
+
+        Returns:
+            The view, which keeps the cloud.
 
         Raises:
             InputError: If no point is in front of the camera, and for anything but n x 3 finite numbers.

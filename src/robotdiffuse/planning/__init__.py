@@ -135,7 +135,7 @@ MAX_LOADED = 8
 
 
 def load_planner(name: str, settings: object | None = None, weights: str | None = None) -> "Planner":
-    """The planner of a name.
+    """Load a planner.
 
     Args:
         name: A name that `robotdiffuse planner list` shows.
@@ -144,9 +144,18 @@ def load_planner(name: str, settings: object | None = None, weights: str | None 
         weights: Folder with weights for a learned planner, in place of the bundled weights. If you also give
             settings, set their field `weights` instead.
 
+    Returns:
+        The planner; its `plan` takes the arguments of `rd.plan`.
+
     Raises:
         InputError: For an unknown name, settings of another planner, settings together with weights, weights
             that cannot be read, and weights for a planner without a network.
+
+    Examples:
+        >>> planner = rd.load_planner("rrt_connect", {"range": 0.5})
+        >>> problem = rd.Problem(rd.load_robot("panda"), rd.Scene(), "ready", "extended")
+        >>> planner.plan(problem, until="first").solved
+        True
     """
     if weights is not None:
         if settings is not None:

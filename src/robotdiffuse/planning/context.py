@@ -129,12 +129,17 @@ class PlanningContext:
     def __init__(
         self, planner_name: str, problem: Problem, request: PlanRequest = PlanRequest(), segments: int = 1
     ) -> None:
-        """Starts the clock.
+        """Start the clock.
 
-        segments: number of planned paths that the motion joins; timing uses this many times as many intervals
-            as for a single path.
+        Args:
+            planner_name: Name of the planner, for the result.
+            problem: The problem.
+            request: The other arguments of the call.
+            segments: Number of planned paths that the motion joins; timing uses this many times as many
+                intervals as for a single path.
 
-        Raises InputError if `problem` is not a Problem.
+        Raises:
+            InputError: If `problem` is not a Problem.
         """
         self.started = clock()
         check_problem(problem)
@@ -169,16 +174,33 @@ class PlanningContext:
         self._prepared = self.elapsed
 
     def note(self, text: str) -> None:
-        """Add a note to the result."""
+        """Add a note to the result.
+
+        Args:
+            text: What was changed or ignored.
+        """
         self.notes = self.notes_with([text])
 
     def notes_with(self, more: Iterable[str]) -> tuple[str, ...]:
-        """The notes of this call and others, each once."""
+        """Join the notes of this call and others.
+
+        Args:
+            more: The other notes.
+
+        Returns:
+            Each note once, those of the call first.
+        """
         return tuple(dict.fromkeys((*self.notes, *more)))
 
     def keeps_constraints(self, q: Configurations) -> bool:
-        """Whether the polyline through configurations, such as a rounded corner, deviates from the path
-        constraints by at most TOLERANCE_FRACTION of their tolerances."""
+        """Check a polyline, such as a rounded corner, against the path constraints.
+
+        Args:
+            q: Its configurations [n, dof].
+
+        Returns:
+            Whether it deviates from the constraints by at most TOLERANCE_FRACTION of their tolerances.
+        """
         constraints = self.validator.constraints
         rows = q if len(q) > 1 else np.repeat(q, 2, axis=0)
         return constraints is None or not constraints.first_violation(
@@ -191,7 +213,11 @@ class PlanningContext:
         return self._progress[0][0] if self._progress else np.inf
 
     def improved(self, length: float) -> None:
-        """Record the joint-space length [rad] of a path that was just found, if it is the shortest so far."""
+        """Record that a path was just found, if it is the shortest so far.
+
+        Args:
+            length: Its length in joint space [rad].
+        """
         if not self._progress or length < self._progress[-1][1]:
             self._progress.append((self.elapsed, length))
 
@@ -219,7 +245,15 @@ class PlanningContext:
         return -1.0 if self._ended else self.search_until - self.elapsed
 
     def fail(self, status: Status, reason: str) -> PlanResult:
-        """The result of a call that found no motion."""
+        """End the call without a motion.
+
+        Args:
+            status: Any status but SOLVED.
+            reason: A sentence that says why there is no motion.
+
+        Returns:
+            The failed result.
+        """
         return PlanResult(
             status=status,
             reason=reason,
@@ -232,8 +266,14 @@ class PlanningContext:
         )
 
     def unsolved(self, reason: str = "") -> PlanResult:
-        """The result of a search that found no path: status TIMEOUT if time has run out, NO_PATH if the
-        search ended before."""
+        """End a search that found no path.
+
+        Args:
+            reason: Why there is no path; empty: that time ran out, or that the search ended.
+
+        Returns:
+            A result with status TIMEOUT if time has run out, and NO_PATH if the search ended before.
+        """
         if self._ended:
             return self.fail(*self._ended)
         if self.remaining <= 0:
@@ -245,11 +285,22 @@ class PlanningContext:
         return self.fail(Status.NO_PATH, reason or ended)
 
     def deadline(self) -> AbstractContextManager[None]:
-        """A context manager within which long steps raise OutOfTimeError when the call's time runs out."""
+        """Limit long steps to the time of the call.
+
+        Returns:
+            A context manager within which they raise OutOfTimeError when time runs out.
+        """
         return deadline(lambda: self.request.time_limit - self.elapsed)
 
     def out_of_time(self, error: OutOfTimeError) -> PlanResult:
-        """The result of a call that ran out of time while preparing the scene or timing a motion."""
+        """End a call that ran out of time while preparing the scene or timing a motion.
+
+        Args:
+            error: What `deadline` raised.
+
+        Returns:
+            A result with status TIMEOUT.
+        """
         return self.fail(Status.TIMEOUT, self._too_short(error))
 
     def _too_short(self, error: OutOfTimeError) -> str:
@@ -278,7 +329,7 @@ class PlanningContext:
         """Validate the path through the waypoints, time it, and validate the motion.
 
         Args:
-            waypoints: The path.
+            waypoints: The path [n, dof] [rad] or [m].
             stage: The part of the planner that found the path.
             reason: The result's reason; empty: "solved by" and the stage.
             notes: Notes on this path, added to those of the call.

@@ -62,13 +62,21 @@ def plan_many(
             of finished problems and the number of all problems.
         request: Arguments of `rd.plan`, the same for all problems: time_limit, seed, until, ...
 
-    Returns: An iterator over the results in the order of the problems. It yields a result as soon as this and
-        all earlier results are finished.
+    Returns:
+        An iterator over the results in the order of the problems. It yields a result as soon as this and all
+        earlier results are finished.
 
     Raises:
         InputError: Before any planning, for an unknown planner, settings or weights that do not fit the
             planner, unknown arguments or arguments out of bounds, a number of workers below 1, and an unknown
             cluster.
+
+    Examples:
+        >>> robot = rd.load_robot("panda")
+        >>> scenes = [rd.Scene([rd.Sphere([0.5, y, 0.7], 0.1)]) for y in (-0.3, 0.3)]
+        >>> problems = [rd.Problem(robot, scene, "ready", "extended") for scene in scenes]
+        >>> [result.solved for result in rd.plan_many(problems, workers=1, until="first")]
+        [True, True]
     """
     check_not_importing()
     if isinstance(problems, str) or not isinstance(problems, Iterable):

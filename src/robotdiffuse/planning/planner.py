@@ -46,14 +46,17 @@ class Planner(ABC, Generic[PlannerSettings]):
     `solve`."""
 
     def __init__(self, settings: PlannerSettings | None = None) -> None:
+        """Keep the settings; `prepare` loads weights.
+
+        Args:
+            settings: An object of `settings_class`; None: its defaults.
+        """
         self.settings = self.settings_class() if settings is None else settings
 
     def plan(self, problem: Problem, *values: Any, **request: Any) -> PlanResult:
-        """Plan a motion. The arguments after the problem are the fields of `PlanRequest`, by name or in their
-        order; `rd.plan` documents them.
+        """Plan a motion.
 
-        The same seed gives the same path, as long as time does not run out. A result with status SOLVED holds
-        a path and a trajectory that passed `verify`; with any other status, `reason` says why there is none.
+        The same seed gives the same path, as long as time does not run out.
 
         Every planner accepts problems with:
 
@@ -68,8 +71,17 @@ class Planner(ABC, Generic[PlannerSettings]):
         Path constraints are supported by aorrtc, rrt_connect, robotdiffuse (`planning/search/constrained.py`)
         and diffusion.
 
-        Raises InputError for arguments out of bounds, for a clearance or constraints that the planner does
-        not support, and for missing weights (see `prepare`).
+        Args:
+            problem: The problem.
+            values: Fields of `PlanRequest` in their order; `rd.plan` documents them.
+            request: Fields of `PlanRequest` by name.
+
+        Returns:
+            A result with a verified path and trajectory, or with a status and a reason why there is none.
+
+        Raises:
+            InputError: For arguments out of bounds, for a clearance or constraints that the planner does not
+                support, and for missing weights (see `prepare`).
         """
         check_problem(problem)
         result = self._plan(problem, PlanRequest(*values, **request))
@@ -91,13 +103,17 @@ class Planner(ABC, Generic[PlannerSettings]):
     def warm_up(self, problem: Problem, until: str = CONVERGED) -> list[PlanResult]:
         """Load or compile the code that planning calls need, so that the first call does not wait for it.
 
-        Without `warm_up`, the first call loads this code itself, outside of its planning time. Pass the
-        `until` of later calls.
+        Without `warm_up`, the first call loads this code itself, outside of its planning time.
 
-        Returns the results of the planning calls that `warm_up` makes: one without obstacles; if that has a
-        path, two with a ball that the tip would meet on the straight line in joint space; and a short one
-        with the first obstacle of each kind in the problem's scene (one triangle of a mesh, one point of a
-        cloud), or with the whole scene if the problem has views.
+        Args:
+            problem: A problem like those of later calls.
+            until: The `until` of later calls.
+
+        Returns:
+            The results of the planning calls that `warm_up` makes. The first is without obstacles. If it has
+            a path, two are with a ball that the tip would meet on the straight line in joint space. The last,
+            short one is with the first obstacle of each kind in the problem's scene (one triangle of a mesh,
+            one point of a cloud), or with the whole scene if the problem has views.
         """
         from robotdiffuse.collision.exact_meshes import warm_up as load_coal
 
@@ -121,8 +137,16 @@ class Planner(ABC, Generic[PlannerSettings]):
         return [*results, call(kinds, SHORT_TIME_LIMIT)]
 
     def attempt(self, problem: Problem, request: PlanRequest) -> PlanResult:
-        """Plan from the problem's start to its goal by one call of `solve`. The problem's waypoints, moving
-        obstacles, start velocity and unknown space are ignored: `planning/pipeline` handles them."""
+        """Plan from the problem's start to its goal by one call of `solve`.
+
+        Args:
+            problem: The problem. Its waypoints, moving obstacles, start velocity and unknown space are
+                ignored, since `planning/pipeline` handles them.
+            request: The arguments of the call.
+
+        Returns:
+            The result of `solve`, or of the call that failed before it.
+        """
         context = PlanningContext(self.name, problem, request)
         followed = None
         lines = any(isinstance(constraint, CartesianLine) for constraint in problem.constraints)
@@ -150,13 +174,26 @@ class Planner(ABC, Generic[PlannerSettings]):
         return self.solve(context, start_goal)
 
     def prepare(self, robot: Robot) -> None:
-        """Preparation that does not count as planning time: learned planners load their weights for the
-        robot, and raise InputError if there are none."""
+        """Prepare to plan, outside of planning time: learned planners load their weights.
+
+        Args:
+            robot: The robot of the next problem.
+
+        Raises:
+            InputError: If there are no weights for the robot.
+        """
 
     @abstractmethod
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
-        """Search from the start to a goal until `context.finish` accepts a path; return
-        `context.unsolved()` if none is found."""
+        """Search from the start to a goal until `context.finish` accepts a path.
+
+        Args:
+            context: Problem, request, clock and random numbers of the call.
+            start_goal: Collision-free start and goal configurations.
+
+        Returns:
+            The result of `context.finish`; that of `context.unsolved` if no path was found.
+        """
 
 
 def pipeline_for(problem: Problem) -> Callable[[Planner, Problem, PlanRequest], PlanResult]:

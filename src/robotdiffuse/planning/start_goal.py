@@ -72,6 +72,14 @@ class StartGoal:
         goals: ndarray,
         constraints: "PathConstraints | None" = None,
     ) -> None:
+        """Find the leads.
+
+        Args:
+            checker: Collision checks of the robot and the scene.
+            start: The start [dof].
+            goals: Goal configurations [n, dof].
+            constraints: Path constraints that leads keep; None: no constraints.
+        """
         robot = self._robot = checker.robot
         self.checker = checker
         self._turns = robot.whole_turns(start)
@@ -87,15 +95,26 @@ class StartGoal:
         self.goal_leads = [lead for lead in leads if lead is not None]
 
     def rows(self) -> tuple[Configuration, Configurations]:
-        """The leads of the start [dof] and of the goals [n, dof], in float32."""
+        """Give the leads to compiled code.
+
+        Returns:
+            The leads of the start [dof] and of the goals [n, dof], in float32.
+        """
         assert self.start_lead is not None
         return self.start_lead.astype(np.float32), np.array(self.goal_leads, np.float32)
 
     def space(self, resolution: float, clearance: float) -> Space:
-        """The space in which searches check motions, at a resolution [m] and a clearance [m].
+        """Make the space in which a search checks motions.
 
         A start or goal may be closer to obstacles than the clearance. Its own clearance then applies there,
         and the clearance grows with the distance from it (`collision.kernels.motions.padding_near`).
+
+        Args:
+            resolution: Largest travel of any point of the arm between two checks [m].
+            clearance: Distance to obstacles [m].
+
+        Returns:
+            The robot and the scene for `collision.kernels.motions.motions_free`.
         """
         start, goals = self.rows()
         states = np.concatenate([start[None], goals])
@@ -109,10 +128,17 @@ class StartGoal:
         return space._replace(lower=lower.astype(np.float32), upper=upper.astype(np.float32))
 
     def complete(self, path: Configurations, direct: bool = False) -> Configurations:
-        """The path of a search from the exact start to the exact goal, in float64.
+        """Lead the path of a search to the exact start and goal.
 
         Where the path ends at a lead that differs from the start or goal, the start or goal is added;
-        otherwise it replaces the path's end. direct: always replace the ends.
+        otherwise it replaces the path's end.
+
+        Args:
+            path: A path from the lead of the start to that of a goal [n, dof].
+            direct: Whether the start and the goal always replace the ends.
+
+        Returns:
+            The path [n, dof], up to two rows longer, in float64.
         """
         assert self.start_lead is not None
         path = path.astype(np.float64)

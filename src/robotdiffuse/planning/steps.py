@@ -106,6 +106,7 @@ class StepsResult:
     """The answer of `Workspace.plan_steps`."""
 
     steps: tuple[Step, ...]
+    """The steps of the call."""
     results: tuple[PlanResult | None, ...]
     """The verified motion of each step, None for `Attach` and `Detach`. If a step failed, its result is the
     last one."""
@@ -149,10 +150,13 @@ class StepsResult:
         return np.cumsum([0.0, *durations])[:-1]
 
     def goal_index(self, name: str) -> int:
-        """Index of the goal at which the motion of a step ends, counted from 0.
+        """Look up the goal at which the motion of a step ends.
 
         Args:
             name: Name of a `MoveTo` step.
+
+        Returns:
+            The index of the goal, from 0; see `PlanResult.goal_index`.
 
         Raises:
             InputError: If no step of this name was planned.

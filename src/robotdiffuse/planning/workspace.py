@@ -32,14 +32,6 @@ class Workspace:
     Poses given as matrices are in the frame of the world. Each call plans for the current obstacles; arrays
     computed for a robot with its held objects are reused. A workspace must be used by one thread only.
 
-    Args:
-        robot: The robot.
-        tip: The link that is moved to poses; None: the tip of the robot.
-        T_world_base: Pose of the robot's base [4, 4]; None: the base is the origin of the world.
-
-    Raises:
-        InputError: For an unknown link, and a pose that is not rigid.
-
     Examples:
         >>> space = rd.Workspace(rd.load_robot("panda"))
         >>> space.add(rd.Sphere([0.5, 0.0, 0.7], 0.2, name="ball"))
@@ -51,6 +43,16 @@ class Workspace:
     """
 
     def __init__(self, robot: Robot, tip: str | None = None, T_world_base: ArrayLike | None = None) -> None:
+        """Begin without obstacles.
+
+        Args:
+            robot: The robot.
+            tip: The link that is moved to poses; None: the tip of the robot.
+            T_world_base: Pose of the robot's base [4, 4]; None: the base is the origin of the world.
+
+        Raises:
+            InputError: For an unknown link, and a pose that is not rigid.
+        """
         self.robot = robot
         """The robot with its held objects."""
         self.tip = robot.tip if tip is None else tip
@@ -164,7 +166,7 @@ class Workspace:
         self.scene, self.robot = self.scene.detach(name, self.robot, self._configuration(q))
 
     def pose(self, q: AnyConfiguration, link: str | None = None) -> ndarray:
-        """The pose of a link.
+        """Forward kinematics: the pose of a link.
 
         Args:
             q: A configuration [dof], values by joint, or the name of a pose.
@@ -172,11 +174,14 @@ class Workspace:
 
         Returns:
             T_world_link [4, 4].
+
+        Raises:
+            InputError: For an unknown link or name, and q of the wrong length or out of limits.
         """
         return self.T_world_base @ self.robot.fk(self._configuration(q), link or self.tip)
 
     def ik(self, pose: ArrayLike, near: ArrayLike | None = None, count: int = 10) -> ndarray:
-        """Configurations that bring the tip to a pose. Collisions are not checked.
+        """Inverse kinematics: configurations that bring the tip to a pose. Collisions are not checked.
 
         Args:
             pose: T_world_tip [4, 4].
@@ -185,15 +190,24 @@ class Workspace:
 
         Returns:
             Distinct configurations [k, dof]; no rows if none was found.
+
+        Raises:
+            InputError: For a pose that is not rigid, and `near` of the wrong length.
         """
         T = self._T_base_world @ rigid_transform("pose", pose)
         return self.robot.ik(T, self.tip, near=near, count=count)
 
     def is_free(self, q: AnyConfiguration) -> StateValidity:
-        """Whether the arm is within its limits and free of collision; see `Problem.is_free`.
+        """Check the joint limits and collisions at a configuration; see `Problem.is_free`.
 
         Args:
             q: A configuration [dof], values by joint, or the name of a pose.
+
+        Returns:
+            A value that is true if the arm is free; otherwise its `reason` says why not.
+
+        Raises:
+            InputError: For q of the wrong length, and for an unknown name.
         """
         return self._problem(self.scene).is_free(q)
 
@@ -205,6 +219,9 @@ class Workspace:
 
         Returns:
             The bound [m], one for each row.
+
+        Raises:
+            InputError: For q of the wrong shape.
         """
         return self._problem(self.scene).clearance_at(q)
 
@@ -228,6 +245,9 @@ class Workspace:
 
         Returns:
             A result with a verified motion, or with a status and a reason why there is none.
+
+        Raises:
+            InputError: For what `rd.Problem` or `rd.plan` does not accept.
         """
         began = clock()
         problem = Problem(self.robot, self.scene, start, self._goal(goal), constraints=constraints)
@@ -292,6 +312,9 @@ class Workspace:
             why. With waypoints, each line is verified, and the lines are joined as by `rd.join`. For an
             `rd.AnyGoal`, `goal_index` is the goal that is reached; if none is, the result is that of the goal
             with the largest `fraction`.
+
+        Raises:
+            InputError: For what `rd.Problem`, `rd.CartesianLine` or `rd.plan` does not accept.
         """
         from robotdiffuse.problems.compiled_constraints import line_end  # compiled code
 

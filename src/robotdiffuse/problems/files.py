@@ -67,9 +67,16 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
         ignore_joints: Whether joints of MoveIt files that the robot lacks are ignored, with a note, instead
             of refused.
 
+    Returns:
+        The problem, with its robot loaded.
+
     Raises:
         InputError: One line that names the file and the field, for unknown or missing fields and shapes,
             values of the wrong type, and what `rd.Problem` does not accept.
+
+    Examples:
+        >>> rd.load_problem("examples/ball.yaml").scene
+        Scene(1 shape: ball)
     """
     file = file_name(file, "problem file")
     check_type("index", index, Integral, "a whole number from 0 on")
@@ -120,13 +127,16 @@ def _lines(text: str) -> list[tuple[int, str]]:
 def problem_record(
     problem: Problem, folder: str | Path | None = None, robot: str | None = None
 ) -> dict[str, object]:
-    """The problem as the plain data of a problem file. Numbers are kept exactly.
+    """Convert a problem to JSON values. Numbers are kept exactly.
 
     Args:
         problem: The problem.
         folder: Files in it or below it are named relative to it, others by their full path.
         robot: The name of the robot, or the path of its URDF, to write; None: the name or path from which
             the robot was loaded.
+
+    Returns:
+        The content of a problem file.
 
     Raises:
         InputError: For a robot that is neither bundled nor loaded from a file.

@@ -37,10 +37,13 @@ class JointGoal(Value):
         super().__post_init__()
 
     def moved(self, T: Pose) -> "JointGoal":
-        """The goal itself: configurations do not move.
+        """Do nothing, since configurations do not move with poses.
 
         Args:
             T: The rigid motion, a homogeneous transform [4, 4].
+
+        Returns:
+            This goal.
         """
         return self
 
@@ -60,6 +63,7 @@ class PoseGoal(Value):
     frame: str
     """Name of the link."""
     T_base_frame: GivenPose
+    """Pose of the link [4, 4]."""
     xyz_tolerance: VectorOrNone = None  # pyright: ignore[reportAssignmentType]
     """Tolerance of the position along the axes of the goal [m]; None: the exact position, validated to 1
     cm."""
@@ -83,10 +87,13 @@ class PoseGoal(Value):
         super().__post_init__()
 
     def moved(self, T: Pose) -> "PoseGoal":
-        """The goal after a rigid motion.
+        """Move the pose.
 
         Args:
             T: The rigid motion, a homogeneous transform [4, 4].
+
+        Returns:
+            The goal after the motion.
         """
         return replace(self, T_base_frame=T @ self.T_base_frame)
 
@@ -102,6 +109,7 @@ class PosesGoal(Value):
     """A pose for each of several links at once, e.g. for both hands of two arms, each with its tolerances."""
 
     poses: Sequence[PoseGoal]
+    """One for each link."""
 
     def __post_init__(self) -> None:
         check_list("goal.poses", self.poses, PoseGoal, "rd.PoseGoal", least=1)
@@ -111,10 +119,13 @@ class PosesGoal(Value):
         object.__setattr__(self, "poses", tuple(self.poses))
 
     def moved(self, T: Pose) -> "PosesGoal":
-        """The goal after a rigid motion.
+        """Move all poses.
 
         Args:
             T: The rigid motion, a homogeneous transform [4, 4].
+
+        Returns:
+            The goal after the motion.
         """
         return PosesGoal([pose.moved(T) for pose in self.poses])
 
@@ -131,6 +142,7 @@ class AnyGoal(Value):
     one."""
 
     goals: "tuple[OneGoal, ...]"
+    """At least one; `PlanResult.goal_index` counts them from 0."""
 
     def __post_init__(self) -> None:
         types = "rd.JointGoal, rd.PoseGoal, rd.PosesGoal and rd.AnyGoal"
@@ -139,10 +151,13 @@ class AnyGoal(Value):
         object.__setattr__(self, "goals", tuple(chain(*goals)))
 
     def moved(self, T: Pose) -> "AnyGoal":
-        """The goals after a rigid motion.
+        """Move all goals.
 
         Args:
             T: The rigid motion, a homogeneous transform [4, 4].
+
+        Returns:
+            The goals after the motion.
         """
         return AnyGoal(tuple(goal.moved(T) for goal in self.goals))
 

@@ -304,17 +304,24 @@ class Problem(Value):
     reached. Each waypoint accepts what `goal` accepts.
 
     Values up to `LIMIT_SLACK` beyond a joint limit are clamped, with a note. Values of continuous joints are
-    not changed: a goal may be reached any number of full turns away. Raises InputError for everything else
-    that no planner could work with: wrong lengths, values that are not finite or out of limits, a goal frame
-    that no planned joint moves. Planners, not this class, detect collisions of start and goal.
+    not changed: a goal may be reached any number of full turns away. Planners, not this class, detect
+    collisions of start and goal.
 
     With views, `scene` holds the given shapes and the points that the views observed (`SeenPoints`).
+
+    Raises:
+        InputError: For everything that no planner could work with, such as wrong lengths, values that are not
+            finite or out of limits, and a goal frame that no planned joint moves.
     """
 
     robot: Robot
+    """The robot, with the tool and the objects that it holds."""
     scene: Scene
+    """The obstacles, in the frame of the base."""
     start: Configuration
+    """Start configuration [dof]."""
     goal: Goal
+    """The goal, in the frame of the base."""
     _: KW_ONLY
     notes: tuple[str, ...] = ()
     """Changes that were made to the input, e.g. a start that was clamped to a limit."""
@@ -411,7 +418,7 @@ class Problem(Value):
         goal: "AnyConfiguration | Goal | Sequence[OneGoal | AnyConfiguration]",
         **options: Unpack[ProblemOptions],
     ) -> "Problem":
-        """A problem given in the frame of the world, for a robot whose base stands anywhere in it.
+        """Make a problem in the frame of the world, for a robot whose base stands anywhere in it.
 
         Scene, poses of goals and waypoints, views, constraints and moving obstacles are given in the frame of
         the world; the problem stores them in the frame of the base.
@@ -424,6 +431,9 @@ class Problem(Value):
             goal: A goal, as `rd.Problem` accepts it.
             options: Further fields of `rd.Problem`.
 
+        Returns:
+            The problem, in the frame of the base.
+
         Raises:
             InputError: As the constructor does.
         """
@@ -435,7 +445,12 @@ class Problem(Value):
         return cls(robot, scene, start, goal, T_world_base=T, **moved_options)  # type: ignore[arg-type]
 
     def robot_and_scene_in_world(self) -> tuple[Robot, Scene]:
-        """The robot and the scene in the world's frame, for pictures and simulators."""
+        """Place the robot and the scene in the world, for pictures and simulators.
+
+        Returns:
+            The robot, with the world as its base, and the scene in the frame of the world; both unchanged if
+            the problem has no `T_world_base`.
+        """
         T = self.T_world_base
         return (self.robot, self.scene) if T is None else (self.robot.placed_in_world(T), self.scene.moved(T))
 
@@ -455,7 +470,7 @@ class Problem(Value):
             q: A configuration [dof], or several [n, dof].
 
         Returns:
-            The bound [m], one for each row; positive: free of collision. It is capped at 1 m, and at 0.3 m
+            The bound [m], one for each row, positive if free of collision. It is capped at 1 m, and at 0.3 m
             if the nearest obstacle is a point cloud or a mesh.
 
         Raises:
@@ -480,7 +495,7 @@ class Problem(Value):
             q: A configuration [dof], values by joint, or the name of a pose.
 
         Returns:
-            A value that is true if the arm is free (`if problem.is_free(q):`); otherwise its `reason` says
+            A value that is true if the arm is free, for `if problem.is_free(q)`; otherwise its `reason` says
             why not.
 
         Raises:

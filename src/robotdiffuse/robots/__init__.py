@@ -39,8 +39,15 @@ def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robo
             compiling a file runs the code in it.
         locked: Values at which joints are locked [rad] or [m] (see `Robot.with_locked`).
 
+    Returns:
+        The robot, with all other movable joints between its base and its tips planned.
+
     Raises:
         InputError: For an unknown name or bad input.
+
+    Examples:
+        >>> rd.load_robot("panda", locked={"panda_finger_joint1": 0.04}).dof
+        7
     """
     check_type("robot", name, (str, PathLike), "its name, or the path of its folder, URDF or MuJoCo model")
     text = str(name)

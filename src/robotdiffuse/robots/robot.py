@@ -120,7 +120,9 @@ class Robot(KinematicTree):
     """
 
     name: str
+    """Name of the robot, by which problem files refer to a bundled one."""
     base: str
+    """Base link, in whose frame poses are given."""
     tip: str
     """Default link for goals and pictures; the first of `tips`."""
     joints: tuple[Joint, ...]
@@ -243,8 +245,12 @@ class Robot(KinematicTree):
         )
 
     def checked_pairs(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of links that are checked against each other: both links have spheres, they are fixed to
-        different frames, and the pair is not in `allowed_collisions`."""
+        """List the pairs of links that are checked against each other.
+
+        Returns:
+            Pairs in which both links have spheres and are fixed to different frames, without those in
+            `allowed_collisions`.
+        """
         return tuple(
             pair
             for pair in moving_pairs(self, self.spheres)
@@ -252,13 +258,16 @@ class Robot(KinematicTree):
         )
 
     def with_locked(self, locked: dict[str, float]) -> "Robot":
-        """The robot with some joints locked at values. Joints that mimic them follow.
+        """Lock joints at values. Joints that mimic them follow.
 
         Values beyond the URDF's limits are accepted up to the joint's range, since some published problems
         open grippers that far. Calls with equal values return the same object.
 
         Args:
             locked: Values [rad] or [m] by joint name. Planned joints may be locked as well.
+
+        Returns:
+            The robot with these joints locked, in addition to those that are locked already.
 
         Raises:
             InputError: For an unknown or fixed joint, a value that is not finite or is farther beyond a limit
@@ -299,7 +308,7 @@ class Robot(KinematicTree):
         return self.bare or self
 
     def attach(self, shape: RigidShape, link: str, touch_links: Sequence[str] = ()) -> "Robot":
-        """The robot holding an object.
+        """Let the robot hold an object.
 
         The object becomes a link with its own name, which goals may use. It is checked for collision with
         obstacles and with all links that do not move with it.
@@ -309,6 +318,9 @@ class Robot(KinematicTree):
                 around it, which is larger by at most 2 % of the radius.
             link: The link that holds the object.
             touch_links: Further links that the object may touch.
+
+        Returns:
+            The robot with the object.
 
         Raises:
             InputError: For unknown links, a link that no planned joint moves, a name that is taken, and a
@@ -332,7 +344,7 @@ class Robot(KinematicTree):
         touch_links: Sequence[str] = (),
         name: str = TOOL,
     ) -> "Robot":
-        """The robot with a tool: a frame that goals may name, and shapes that are part of the arm.
+        """Add a tool: a frame that goals may name, and shapes that are part of the arm.
 
         The tool becomes the tip if no planned joint comes after its link.
 
@@ -342,6 +354,9 @@ class Robot(KinematicTree):
             shapes: Shapes of the tool, in the frame of `link`.
             touch_links: Links that the shapes may touch.
             name: Name of the tool's frame.
+
+        Returns:
+            The robot with the tool.
 
         Raises:
             InputError: In the cases in which `attach` raises it, and if the robot already has a tool.
@@ -353,14 +368,17 @@ class Robot(KinematicTree):
         return self.with_body(AttachedBody(name, link, T, tuple(shapes), tuple(touch_links), tool=True))
 
     def with_body(self, body: AttachedBody) -> "Robot":
-        """The robot with a body attached. Calls with bodies of equal content return the same object.
+        """Attach a body. Calls with bodies of equal content return the same object.
 
         Args:
             body: The held object or tool.
 
+        Returns:
+            The robot with the body.
+
         Raises:
-            InputError: For unknown links, a link that no planned joint moves, a name that a link
-            already has, and shapes that cannot be attached.
+            InputError: For unknown links, a link that no planned joint moves, a name that a link already has,
+                and shapes that cannot be attached.
         """
         field = TOOL if body.tool else "attached"
         self.check_moved(f"{field}.link", body.link)
@@ -373,10 +391,13 @@ class Robot(KinematicTree):
         return _with_body(self, body)
 
     def detach(self, name: str) -> "Robot":
-        """The robot without a held object or tool.
+        """Detach a held object or tool.
 
         Args:
             name: Name of the object or tool.
+
+        Returns:
+            The robot without it.
 
         Raises:
             InputError: For an unknown name, and for a body to which another body is attached.
@@ -396,11 +417,13 @@ class Robot(KinematicTree):
         return reduce(Robot.with_body, remaining, self.arm)
 
     def placed_in_world(self, T_world_base: Pose) -> "Robot":
-        """The robot with a new base link, the world, to which the old base is fixed; for pictures and
-        simulators.
+        """Fix the base to a new base link, the world; for pictures and simulators.
 
         Args:
             T_world_base: Pose of the old base in the world [4, 4].
+
+        Returns:
+            The robot with the world as its base.
         """
         name = "world"
         while name in self.link_names:

@@ -39,26 +39,25 @@ POSE_TOLERANCE = 1e-6
 class MovingObstacle(Value):
     """A shape with its pose at time 0, in the frame of the robot's base, and one of three motions.
 
-    velocity: the shape keeps its orientation and moves at a constant velocity forever.
-    times and poses: the pose of the shape's frame at each time. Between these times, the shape moves on
-    straight lines at constant speed and turns at a constant rate. Before the first and after the last time it
-    stands still.
-    max_speed: the motion is unknown, but no point of the shape is faster than this.
+    Args:
+        shape: The shape at time 0; not a point cloud, which has no frame of its own.
+        velocity: The shape keeps its orientation and moves at this constant velocity forever [m/s].
+        times: Times of the poses [n], increasing [s].
+        poses: T_base_shape at each time [n, 4, 4], at first the pose of the shape. Between the times, the
+            shape moves on straight lines at constant speed and turns at a constant rate. Before the first and
+            after the last time it stands still.
+        max_speed: The motion is unknown, but no point of the shape is faster than this [m/s].
 
-    Raises InputError unless exactly one of these motions is given, and for values that are not finite, times
-    that do not increase, poses that jump (a point is faster than MAX_POINT_SPEED), a first pose that is not
-    the pose of the shape, negative speeds, and point clouds, which have no frame of their own.
+    Raises:
+        InputError: Unless exactly one motion is given: velocity, times and poses, or max_speed; for wrong
+            values; and for poses that jump, where a point is faster than 100 m/s.
     """
 
     shape: Shape
     velocity: VectorOrNone = None  # pyright: ignore[reportAssignmentType]
-    """Constant velocity [m/s]."""
     times: ArrayOrNone = None  # pyright: ignore[reportAssignmentType]
-    """Times of the poses [s], increasing."""
     poses: ArrayOrNone = None  # pyright: ignore[reportAssignmentType]
-    """T_base_shape at each time."""
     max_speed: float | None = None
-    """Upper bound on the speed of all points of an obstacle with unknown motion [m/s]."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.shape, Shape):
@@ -191,19 +190,24 @@ class MovingObstacle(Value):
         return transform(xyz, rotation_from_quaternion(_slerp(a, b, fraction)))
 
     def at(self, time: float) -> Shape:
-        """The shape at its pose at a time.
+        """Place the shape at its pose at a time.
 
         Args:
-            time: Time since the motion begins [s]. If the motion is unknown, the shape is returned at its
-                pose at time 0.
+            time: Time since the motion begins [s].
+
+        Returns:
+            The shape; if the motion is unknown, at its pose at time 0.
         """
         return self.shape.moved(self.pose(time) @ inverse(self.shape.T_base_shape))
 
     def moved(self, T: Pose) -> "MovingObstacle":
-        """The obstacle, moved by a rigid motion together with its own motion.
+        """Move the obstacle together with its own motion.
 
         Args:
             T: The rigid motion, a homogeneous transform [4, 4].
+
+        Returns:
+            The obstacle after the rigid motion.
         """
         velocity = None if self.velocity is None else T[:3, :3] @ self.velocity
         poses = None if self.poses is None else T @ self.poses

@@ -32,17 +32,14 @@ PLANE_DEPTH = 0.1
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class Scene(Value):
-    """Obstacles in the frame of the robot's base. A number is appended to names that are not unique.
+    """Obstacles in the frame of the robot's base.
 
-    allowed_contacts: for obstacles by name, the links that may touch the obstacle, or "all", such as {"mug":
-    ["panda_hand", "panda_leftfinger"], "table": "all"}. Held objects and tools are links too. If several
-    shapes were given the same name, the name stands for all of them. Allowed contacts are not collisions for
-    searches, validators and certificates, and are left out of clearances.
-
-    Raises InputError for values that are not shapes, and for allowed contacts with unknown obstacles.
+    Allowed contacts are not collisions for searches, validators and certificates, and are left out of
+    clearances.
     """
 
     shapes: tuple[Shape, ...] = ()
+    """The obstacles, with different names."""
     allowed_contacts: tuple[tuple[str, tuple[str, ...] | str], ...] = ()
     """Names of obstacles, each with the names of links that may touch it, or ALL_LINKS."""
 
@@ -51,6 +48,17 @@ class Scene(Value):
         shapes: Iterable[Shape] = (),
         allowed_contacts: Mapping[str, Sequence[str] | str] | Iterable[tuple[str, Sequence[str] | str]] = (),
     ) -> None:
+        """Check the shapes, and append a number to names that are not unique.
+
+        Args:
+            shapes: The obstacles.
+            allowed_contacts: For obstacles by name, the links that may touch the obstacle, or "all", such as
+                {"mug": ["panda_hand", "panda_leftfinger"], "table": "all"}. Held objects and tools are links
+                too. If several shapes were given the same name, the name stands for all of them.
+
+        Raises:
+            InputError: For values that are not shapes, and for allowed contacts with unknown obstacles.
+        """
         named: list[Shape] = []
         names_in_use = set[str]()
         last = dict[str, int]()
@@ -90,7 +98,7 @@ class Scene(Value):
                 reads from a model has the base "world".
 
         Returns:
-            Scene: Planes become boxes of their size; an infinite plane becomes a box of 10 m. Meshes are
+            The scene. Planes become boxes of their size; an infinite plane becomes a box of 10 m. Meshes are
             replaced by their convex hulls, as MuJoCo does.
 
         Raises:
@@ -99,19 +107,27 @@ class Scene(Value):
         return cls(_mujoco_shapes(model, data, base))
 
     def moved(self, T: Pose) -> "Scene":
-        """The scene after a rigid motion.
+        """Move all obstacles.
 
         Args:
             T: The rigid motion, a homogeneous transform [4, 4].
+
+        Returns:
+            The scene after the motion.
+
+        Raises:
+            InputError: For shapes that cannot be moved.
         """
         return self.with_shapes([shape.moved(T) for shape in self.shapes])
 
     def with_shapes(self, shapes: Iterable[Shape]) -> "Scene":
-        """A scene with other shapes. Allowed contacts are kept for shapes with the name of a shape of this
-        scene.
+        """Replace the shapes.
 
         Args:
             shapes: The obstacles of the new scene.
+
+        Returns:
+            A scene with these shapes, and with the allowed contacts of those whose names this scene has.
         """
         scene = Scene(shapes)
         if self.allowed_contacts:
@@ -121,11 +137,14 @@ class Scene(Value):
         return scene
 
     def may_touch(self, link: str, obstacle: str) -> bool:
-        """Whether contact between a link and an obstacle is allowed.
+        """Look up whether contact is allowed.
 
         Args:
             link: Name of a link or held object.
             obstacle: Name of an obstacle.
+
+        Returns:
+            Whether the link may touch the obstacle.
         """
         links = self._links_that_touch.get(obstacle, ())
         return links == ALL_LINKS or link in links
@@ -142,7 +161,7 @@ class Scene(Value):
         link: str | None = None,
         touch_links: Sequence[str] = (),
     ) -> tuple["Scene", Robot]:
-        """Lets the robot grasp an obstacle of the scene.
+        """Let the robot grasp an obstacle of the scene.
 
         Args:
             name: Name of the obstacle.
@@ -165,7 +184,7 @@ class Scene(Value):
         return self.with_shapes(obstacles.values()), robot.attach(taken_shape, link, touch_links)
 
     def detach(self, name: str, robot: Robot, q: Configuration) -> tuple["Scene", Robot]:
-        """Lets the robot release a held object.
+        """Let the robot release a held object.
 
         Args:
             name: Name of the held object.

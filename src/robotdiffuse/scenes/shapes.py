@@ -67,18 +67,29 @@ class Shape(Value, ABC):
         raise self._not_solid()
 
     def moved(self, T: Pose) -> "Shape":
-        """The shape after the rigid motion T. For a moved point cloud, `file` is None.
+        """Move the shape.
 
-        Raises InputError for kinds of shapes that do not support motions.
+        Args:
+            T: The rigid motion, a homogeneous transform [4, 4].
+
+        Returns:
+            The shape after the motion. For a point cloud, `file` is None.
+
+        Raises:
+            InputError: For kinds of shapes that do not support motions.
         """
         raise InputError(f"a {self.kind} cannot be moved; write it as a mesh")
 
     def solid(self) -> tuple[Pose, tuple[ConvexMesh, ...]]:
-        """T_base_shape, and convex meshes in the shape's own frame that enclose the shape; used when a robot
-        holds it.
+        """Enclose the shape in convex meshes, for a robot that holds it.
 
-        The mesh of a box is exact; round shapes are enclosed by a polyhedron. Raises InputError for point
-        clouds and height maps.
+        The mesh of a box is exact; round shapes are enclosed by a polyhedron.
+
+        Returns:
+            T_base_shape [4, 4], and the meshes in the shape's own frame.
+
+        Raises:
+            InputError: For point clouds and height maps.
         """
         from robotdiffuse.scenes.convex_solids import SOLIDS  # SciPy, which few problems need
 
@@ -140,10 +151,10 @@ value. It returns the value to store, or raises InputError."""
 class Sphere(Shape):
     """A ball.
 
-    center: x y z in the frame of the robot's base [m].
-    radius: [m].
-    name: the sphere's name in results, commands and allowed contacts; a scene appends a number to names that
-    are not unique.
+    Args:
+        center: x y z in the frame of the robot's base [m].
+        radius: Radius [m].
+        name: Name in results, commands and allowed contacts.
     """
 
     center: GivenVector
@@ -164,10 +175,13 @@ class Sphere(Shape):
         return transform(self.center)
 
     def moved(self, T: Pose) -> "Shape":
-        """The sphere after a rigid motion.
+        """Move the sphere.
 
         Args:
             T: The rigid motion, a homogeneous transform [4, 4].
+
+        Returns:
+            The sphere after the motion.
         """
         return replace(self, center=T[:3, :3] @ self.center + T[:3, 3])
 
@@ -198,16 +212,15 @@ class _Posed(Shape):
 class Box(_Posed):
     """A box of any orientation.
 
-    center: middle of the box, x y z in the frame of the robot's base [m].
-    size: full edge lengths along the box's own x, y and z [m].
-    wxyz: orientation as a quaternion, scalar first; default: along the axes of the base.
-    name: the box's name in results, commands and allowed contacts; a scene appends a number to names that are
-    not unique.
+    Args:
+        center: Middle of the box, x y z in the frame of the robot's base [m].
+        size: Full edge lengths along the box's own x, y and z [m].
+        wxyz: Orientation as a quaternion, scalar first; default: along the axes of the base.
+        name: Name in results, commands and allowed contacts.
     """
 
     center: GivenVector
     size: GivenVector
-    """Full edge lengths [m]."""
     wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     name: str = "box"
     kind: ClassVar[str] = "box"
@@ -239,10 +252,12 @@ class _Axial(_Posed):
 class Cylinder(_Axial):
     """A cylinder about its own z axis.
 
-    center: middle of the cylinder, x y z in the frame of the robot's base [m].
-    radius, height: [m].
-    wxyz: orientation as a quaternion, scalar first; default: axis along z of the base.
-    name: see `Box`.
+    Args:
+        center: Middle of the cylinder, x y z in the frame of the robot's base [m].
+        radius: Radius [m].
+        height: Height [m].
+        wxyz: Orientation as a quaternion, scalar first; default: axis along z of the base.
+        name: Name in results, commands and allowed contacts.
     """
 
     name: str = "cylinder"
@@ -264,11 +279,12 @@ class Cylinder(_Axial):
 class Capsule(_Axial):
     """A cylinder about its own z axis with a half sphere at each end.
 
-    center: middle of the capsule, x y z in the frame of the robot's base [m].
-    radius: of the cylinder and the half spheres [m].
-    height: of the cylinder, without the half spheres [m].
-    wxyz: orientation as a quaternion, scalar first; default: axis along z of the base.
-    name: see `Box`.
+    Args:
+        center: Middle of the capsule, x y z in the frame of the robot's base [m].
+        radius: Radius of the cylinder and the half spheres [m].
+        height: Height of the cylinder, without the half spheres [m].
+        wxyz: Orientation as a quaternion, scalar first; default: axis along z of the base.
+        name: Name in results, commands and allowed contacts.
     """
 
     name: str = "capsule"
@@ -290,14 +306,15 @@ class PointCloud(Shape):
     """A point cloud; each point is a small sphere. The cloud may be empty. `PointCloud.from_file` reads a
     file.
 
-    points: n x 3, in the frame of the robot's base [m].
-    point_radius: radius of the sphere around each point [m].
-    name: see `Box`.
+    Args:
+        points: The points [n, 3] in the frame of the robot's base [m].
+        point_radius: Radius of the sphere around each point [m].
+        file: The file that the cloud was read from. A problem that is saved refers to this file.
+        name: Name in results, commands and allowed contacts.
     """
 
     points: GivenArray
     point_radius: float = POINT_RADIUS
-    """Radius of the sphere around each point [m]."""
     file: str | None = None
     name: str = "point_cloud"
     kind: ClassVar[str] = "point_cloud"
@@ -310,7 +327,7 @@ class PointCloud(Shape):
         scale: float = 1.0,
         name: str = "point_cloud",
     ) -> "PointCloud":
-        """Reads a point cloud from a file.
+        """Read a point cloud from a file.
 
         Points that are not finite are left out, with a warning.
 
@@ -321,6 +338,9 @@ class PointCloud(Shape):
                 of the sphere around a voxel, multiplied by `scale`.
             scale: Meters for each unit of the file: 0.001 for millimeters.
             name: Name of the obstacle, for messages and allowed contacts.
+
+        Returns:
+            The cloud.
 
         Raises:
             InputError: For a file that cannot be read, or a scale that is not positive.
@@ -355,10 +375,13 @@ class PointCloud(Shape):
         return read_only(np.stack([low - self.point_radius, high + self.point_radius]))
 
     def moved(self, T: Pose) -> "Shape":
-        """The cloud after a rigid motion.
+        """Move the points.
 
         Args:
             T: The rigid motion, a homogeneous transform [4, 4].
+
+        Returns:
+            The cloud after the motion, without its `file`.
         """
         return replace(self, points=placed(T, self.points), file=None)
 
@@ -386,19 +409,20 @@ class Mesh(_Posed, Triangulated):
     """A triangle mesh. Only its surface is checked for collision, not the space inside. `Mesh.from_file`
     reads a file.
 
-    vertices: n x 3, in the mesh's own frame [m].
-    faces: n x 3 indices of vertices, from 0.
-    xyz, wxyz: pose of the mesh's frame in the frame of the robot's base.
-    name: see `Box`.
+    Args:
+        vertices: Vertices [n, 3] in the mesh's own frame [m].
+        faces: Indices of vertices [n, 3], from 0.
+        xyz: Position of the mesh's frame in the frame of the robot's base [m].
+        wxyz: Orientation of the mesh's frame as a quaternion, scalar first.
+        file: The file that the mesh was read from. A problem that is saved refers to this file.
+        name: Name in results, commands and allowed contacts.
     """
 
     vertices: GivenArray
-    """Vertices in the frame of the mesh [m]."""
     faces: GivenArray
     xyz: GivenVector = (0.0, 0.0, 0.0)  # type: ignore[assignment]
     wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     file: str | None = None
-    """The file that the shape was read from. A problem that is saved refers to this file."""
     name: str = "mesh"
     kind: ClassVar[str] = "mesh"
     origin: ClassVar[str] = "xyz"
@@ -424,7 +448,7 @@ class Mesh(_Posed, Triangulated):
         scale: float = 1.0,
         name: str = "mesh",
     ) -> "Mesh":
-        """Reads a mesh from a file of a format that trimesh reads (.stl, .obj, .ply, .dae, .glb, ...).
+        """Read a mesh from a file of a format that trimesh reads (.stl, .obj, .ply, .dae, .glb, ...).
 
         Args:
             file: The file.
@@ -432,6 +456,9 @@ class Mesh(_Posed, Triangulated):
             wxyz: Orientation of the file's frame, a quaternion.
             scale: Meters for each unit of the file: 0.001 for millimeters.
             name: Name of the obstacle, for messages and allowed contacts.
+
+        Returns:
+            The mesh, of all parts of the file.
 
         Raises:
             InputError: For a file that cannot be read, or a scale that is not positive.
@@ -470,12 +497,15 @@ class HeightMap(_Posed, Triangulated):
     """Terrain: heights at the points of a grid, joined by triangles. Only this surface is checked for
     collision.
 
-    heights: heights along z [m], with rows along y and columns along x. Cells with a height that is not a
-    number are holes.
-    cell: distance between neighboring points of the grid [m].
-    xyz, wxyz: pose of the height map's frame in the frame of the robot's base. The origin of the height map's
-        frame is the first point of the grid, at height 0.
-    name: see `Box`.
+    Args:
+        heights: Heights along z [m], with rows along y and columns along x [rows, columns]. Cells with a
+            height that is not a number are holes.
+        cell: Distance between neighboring points of the grid [m].
+        xyz: Position of the height map's frame in the frame of the robot's base [m]. The origin of the height
+            map's frame is the first point of the grid, at height 0.
+        wxyz: Orientation of the height map's frame as a quaternion, scalar first.
+        file: The file that the heights were read from. A problem that is saved refers to this file.
+        name: Name in results, commands and allowed contacts.
     """
 
     heights: GivenArray
@@ -483,7 +513,6 @@ class HeightMap(_Posed, Triangulated):
     xyz: GivenVector = (0.0, 0.0, 0.0)  # type: ignore[assignment]
     wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     file: str | None = None
-    """The file that the shape was read from. A problem that is saved refers to this file."""
     name: str = "height_map"
     kind: ClassVar[str] = "height_map"
     origin: ClassVar[str] = "xyz"

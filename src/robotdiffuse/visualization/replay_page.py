@@ -511,7 +511,7 @@ class Replay:
 
 
 def show(result: PlanResult | ResultFile, problem: Problem | None = None, height: int = 560) -> Replay:
-    """The replay of a result, for the last line of a notebook cell.
+    """Show the replay of a result, as the last line of a notebook cell.
 
     Elsewhere in a cell, use `display(rd.show(result))`. If the result has no motion, the start, the goal and
     colliding links are shown.
@@ -522,8 +522,16 @@ def show(result: PlanResult | ResultFile, problem: Problem | None = None, height
             were saved with their problem, contain it.
         height: Height of the replay [pixels].
 
+    Returns:
+        The replay, which notebooks display.
+
     Raises:
         InputError: Outside a notebook, and if the problem is unknown.
+
+    Example:
+        ```python
+        rd.show(rd.plan(rd.load_problem("examples/ball.yaml")))
+        ```
     """
     check_type("result", result, (PlanResult, ResultFile), "a result of rd.plan or rd.load_result")
     if problem is not None:

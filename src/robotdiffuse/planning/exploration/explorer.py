@@ -112,12 +112,20 @@ class Explorer:
         settings: ExplorerSettings = DEFAULTS,
         seed: int = 0,
     ) -> None:
-        """
-        cameras: the cameras on the arm, for which motions to viewpoints are planned. Views of other cameras
-            can be observed as well.
-        scene: shapes that are known without views, such as the floor.
-        free_zone: low and high corner of a box [m] that counts as free unless a view finds something there,
-            such as the space around the arm's base.
+        """Begin with an empty map; `set_goal` and `observe` come next.
+
+        Args:
+            robot: The robot.
+            cameras: The cameras on the arm, for which motions to viewpoints are planned. Views of other
+                cameras can be observed as well.
+            scene: Shapes that are known without views, such as the floor, in the frame of the base.
+            free_zone: Low and high corner [2, 3] of a box in the frame of the base [m] that counts as free
+                unless a view finds something there, such as the space around the arm's base; None: no box.
+            settings: The policy for unseen space, and limits of time and views.
+            seed: Seed of all random numbers, at least 0.
+
+        Raises:
+            InputError: For arguments of the wrong type or out of bounds.
         """
         check_type("robot", robot, Robot, "a Robot, e.g. rd.load_robot('panda')")
         check_type("cameras", cameras, (list, tuple), "a list of ArmCamera")
@@ -195,10 +203,13 @@ class Explorer:
 
     @locked
     def next(self, configuration: ArrayLike) -> Step:
-        """The next step of the arm, which must be at rest.
+        """Choose the next step of the arm, which must be at rest.
 
         Args:
             configuration: The arm's present configuration [dof].
+
+        Returns:
+            The step, which is to go to the goal, to look, done, or stuck with the reason.
 
         Raises:
             InputError: Before `set_goal`, and for values that are no configuration of the robot.
@@ -242,22 +253,21 @@ class Explorer:
 
     @locked
     def wanted(self, path: Path) -> Voxels:
-        """The voxels that views should show.
-
-        They are the unknown voxels that a tentative motion sweeps and, if the goal must be seen, the unseen
-        voxels at the arm's surface at the goal.
+        """Mark the voxels that views should show.
 
         Args:
-            path: The tentative motion.
+            path: A tentative motion.
+
+        Returns:
+            True [nx, ny, nz] for the unknown voxels that the motion sweeps and, if the goal must be seen, for
+            the unseen voxels at the arm's surface at the goal.
         """
         return swept_unseen(self.map, path) | self._goal_seen.wanted(path)
 
     @locked
     def stop(self, motion: Trajectory, time: float) -> Stop | None:
-        """How a motion under way ends early, if views observed since `next` returned it show an obstacle in
-        its way.
-
-        After the stop, call `next` again.
+        """End a motion under way early, if views observed since `next` returned it show an obstacle in its
+        way. After the stop, call `next` again.
 
         Args:
             motion: The motion under way.
@@ -551,10 +561,12 @@ class Explorer:
 
     @locked
     def predicted(self) -> Probabilities | None:
-        """The predicted probability that each voxel is occupied; 0 in voxels that the map knows to be free.
+        """Predict occupancy by the completion network.
 
-        None if the settings exclude the network, if the network does not cover the arm's reach, and before
-        the first view.
+        Returns:
+            The probability [nx, ny, nz] that each voxel is occupied, 0 in voxels that the map knows to be
+            free. None if the settings exclude the network, if the network does not cover the arm's reach, and
+            before the first view.
         """
         if not (len(self._views) and self.settings.predict):
             return None

@@ -23,6 +23,7 @@ class ArmCamera(Value):
     collisions."""
 
     link: str
+    """Name of the link."""
     T_link_camera: Pose
     """Pose of the optical frame: x to the right in the image, y down, z ahead."""
     intrinsics: tuple[float, float, float, float]

@@ -234,6 +234,7 @@ class NextView(Value):
     """A camera pose, and how much it sees of the unknown space that a motion sweeps."""
 
     T_base_camera: Pose
+    """Pose of the camera [4, 4]."""
     seen: float
     """Fraction of this space that a camera with this pose is expected to see, weighted by the probability
     that the space is occupied."""
@@ -248,7 +249,7 @@ def poses_around() -> list[Pose]:
 
 
 def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None = None) -> NextView:
-    """The camera pose that shows the most of what a motion may collide with.
+    """Choose the camera pose that shows the most of what a motion may collide with.
 
     Of the given poses, it is the one from which a camera with the intrinsics of the first view sees the
     largest share of the unknown voxels that the motion sweeps. Each voxel counts with the predicted
@@ -259,10 +260,21 @@ def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None
     Args:
         problem: A problem with views.
         result: The result that holds the motion.
-        poses: Camera poses T_base_camera [4, 4] to choose from; None: `poses_around`.
+        poses: Camera poses T_base_camera [4, 4] to choose from; None: 48 poses around the base.
+
+    Returns:
+        The pose, and how much of the space a camera there is expected to see.
 
     Raises:
         InputError: The problem has no views, the result has no motion, or `poses` is empty.
+
+    Examples:
+        >>> T_base_camera = rd.pose([0.3, -1, 0.5], rpy=[-np.pi / 2, 0, 0])  # it looks along y
+        >>> view = rd.DepthView(np.full((48, 64), 1.6), [50, 50, 31.5, 23.5], T_base_camera)
+        >>> robot = rd.load_robot("panda")
+        >>> problem = rd.Problem(robot, rd.Scene(), "ready", "extended", views=[view], unknown="padded")
+        >>> rd.next_view(problem, rd.plan(problem, until="first")).seen > 0.9
+        True
     """
     check_problem(problem)
     check_type("result", result, PlanResult, "a PlanResult, as rd.plan returns it")

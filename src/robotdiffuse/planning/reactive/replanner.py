@@ -210,10 +210,16 @@ class Replanner:
     def __init__(
         self, problem: Problem, settings: ReplannerSettings = ReplannerSettings(), seed: int = 0
     ) -> None:
-        """Finds the first path.
+        """Find the first path, which takes up to 10 s.
 
-        Raises InputError for a problem without moving obstacles, with waypoints, constraints or a payload, or
-        without a path in the static scene.
+        Args:
+            problem: The problem, with moving obstacles.
+            settings: Period, clearance and limits of the motions.
+            seed: Seed of all random numbers, at least 0.
+
+        Raises:
+            InputError: For a problem without moving obstacles, with waypoints, constraints or a payload, or
+                without a path in the static scene.
         """
         check_problem(problem)
         check_type("settings", settings, ReplannerSettings, "ReplannerSettings")
@@ -281,13 +287,16 @@ class Replanner:
 
     @locked
     def step(self, observation: Mapping[str, ArrayLike], now: float) -> Command:
-        """The motion that begins one period after `now`, given the obstacles as observed at `now`.
+        """Find the motion that begins one period after `now`, given the obstacles as observed at `now`.
 
         Args:
             observation: For each observed obstacle, by name, T_base_obstacle [4, 4] or only the origin of its
                 frame [3]. An obstacle that is missing may be anywhere that it can have reached since it was
                 last seen.
             now: Time of the observation [s]; it must grow from step to step.
+
+        Returns:
+            The motion to execute, which ends at rest, and the time at which it begins.
 
         Raises:
             InputError: For unknown names, invalid poses, time that does not grow, and obstacles that were

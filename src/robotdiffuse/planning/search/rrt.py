@@ -153,16 +153,18 @@ class AnytimeSearch:
         stop: Callable[[], bool] = lambda: False,
         improved: Callable[[float], None] = lambda length: None,
     ) -> None:
-        """
-        start_goal: start and goals.
-        settings: settings of the search.
-        name: what results report as their `stage`, the part of the planner that found the motion.
-        seed: seed of the random numbers.
-        clearances: clearances to try in turn, falling [m].
-        bounded: whether rounds have a bound on length (AORRTC); False: they are restarts (RRT-Connect).
-        tries: number of iterations without a path before the next clearance is tried.
-        stop: whether the search must end now.
-        improved: called with the length [rad] of each path that is the best so far.
+        """Begin without trees.
+
+        Args:
+            start_goal: Start and goals.
+            settings: Settings of the search.
+            name: What results report as their `stage`, the part of the planner that found the motion.
+            seed: Seed of the random numbers.
+            clearances: Clearances to try in turn, falling [m].
+            bounded: Whether rounds have a bound on length (AORRTC); False: they are restarts (RRT-Connect).
+            tries: Number of iterations without a path before the next clearance is tried.
+            stop: Whether the search must end now.
+            improved: Called with the length [rad] of each path that is the best so far.
         """
         self.start_goal = start_goal
         self.settings = settings
@@ -211,7 +213,18 @@ class AnytimeSearch:
         name: str,
         bounded: bool = True,
     ) -> "AnytimeSearch":
-        """The search of a planning call; it ends when the call's time for searching has run out."""
+        """Make the search of a planning call.
+
+        Args:
+            context: The call.
+            start_goal: Start and goals.
+            settings: Settings of the search.
+            name: The `stage` of results, as in the constructor.
+            bounded: Whether rounds have a bound on length, as in the constructor.
+
+        Returns:
+            A search that ends when the call's time for searching has run out.
+        """
         return cls(
             start_goal,
             settings,
@@ -249,7 +262,14 @@ class AnytimeSearch:
         )
 
     def first(self, work: float = np.inf) -> bool:
-        """Search for a first path, for at most `work` more iterations; returns whether there is a path."""
+        """Search for a first path.
+
+        Args:
+            work: Largest number of further iterations.
+
+        Returns:
+            Whether there is a path.
+        """
         if self.best is None:
             self._try_straight_lines()
         work_limit = self.work + work
@@ -262,7 +282,11 @@ class AnytimeSearch:
         return self.best is not None
 
     def improve(self, work: int) -> None:
-        """Search for shorter paths, for at most `work` more iterations, or until the path is optimal."""
+        """Search for shorter paths, until the path is optimal.
+
+        Args:
+            work: Largest number of further iterations.
+        """
         work_limit = self.work + work
         if self._untightened and self.best is not None:
             self.offer(self.best, self.history[-1][1])
@@ -271,13 +295,29 @@ class AnytimeSearch:
             self._iterate()
 
     def improves(self, gain: float, patience: int) -> bool:
-        """`still_improves` for the length of the best path and the number of iterations."""
+        """Judge whether more iterations are likely to shorten the best path.
+
+        Args:
+            gain: Smallest fraction by which the last doubling of their number must have shortened it.
+            patience: Number of iterations before which the answer is yes.
+
+        Returns:
+            Whether to go on; see `still_improves`.
+        """
         return still_improves(self._lengths, self.work, float(self.length), gain, patience)
 
     def offer(self, path: Configurations, stage: str) -> bool:
-        """Simplify a path from the start to a goal, and make it the best path if its cost is lower; returns
-        whether it is lower. The path must be free in `space`. If the objective is time, the path may also
-        become a candidate for the fastest motion."""
+        """Simplify a path, and make it the best path if its cost is lower.
+
+        If the objective is time, the path may also become a candidate for the fastest motion.
+
+        Args:
+            path: A path from the start to a goal [n, dof], free in `space`.
+            stage: The part of the planner that found it.
+
+        Returns:
+            Whether it is the best path now.
+        """
         path = self.simplified(path)
         if self.motions is not None and path_length(path) < NEAR_FACTOR * self.length:
             self.motions.offer(self.space, path, stage)
@@ -290,8 +330,14 @@ class AnytimeSearch:
         return True
 
     def simplified(self, path: Configurations) -> Configurations:
-        """A path from the start to a goal after simplification, and after tightening if it is about as short
-        as the best path."""
+        """Simplify a path, and tighten it if it is about as short as the best path.
+
+        Args:
+            path: A path from the start to a goal [n, dof].
+
+        Returns:
+            The path with other waypoints [m, dof].
+        """
         path = for_kernels(path, np.float32)
         if self._shortens:
             path = simplify(self.space, path, self.settings.smoothings)
@@ -302,7 +348,14 @@ class AnytimeSearch:
         return path
 
     def cost_of(self, path: Configurations) -> float:
-        """The cost by which paths are compared: the length [rad]."""
+        """Compute the cost by which paths are compared.
+
+        Args:
+            path: A path [n, dof].
+
+        Returns:
+            Its length in joint space [rad].
+        """
         return float(path_length(path))
 
     def _set_best(self, path: Configurations | None) -> None:
@@ -313,13 +366,25 @@ class AnytimeSearch:
         self._trees = None
 
     def keeps_clearance(self, q: Configurations) -> bool:
-        """Whether the polyline through configurations keeps the clearance of the search."""
+        """Check a polyline against the clearance of the search.
+
+        Args:
+            q: Its configurations [n, dof].
+
+        Returns:
+            Whether all of it keeps the clearance.
+        """
         return bool(motions_free(self.space, for_kernels(q, np.float32)).all())
 
     def refuse(self, accepted: Configurations | None) -> None:
-        """Go back to `accepted`, the last valid path (None: no path), after the validator refused the best
-        path, and halve the resolution. At the finest resolution, paths are not shortened any more, because
-        shortening could lead to the refused path again."""
+        """Go back to the last valid path after the validator refused the best path, and halve the resolution.
+
+        At the finest resolution, paths are not shortened any more, because shortening could lead to the
+        refused path again.
+
+        Args:
+            accepted: The last valid path [n, dof]; None: there is none.
+        """
         finer = finer_resolution(self.settings.resolution)
         self._shortens = finer < self.settings.resolution
         self.settings = replace(self.settings, resolution=finer)
@@ -588,8 +653,14 @@ def anytime(
 ) -> PlanResult:
     """Search for a path, and then for better paths as long as the call's `until` requires.
 
-    improves: whether more search is likely to shorten the path.
-    improve: searches for shorter paths for a short time.
+    Args:
+        context: The planning call.
+        search: Its search.
+        improves: Whether more search is likely to shorten the path.
+        improve: Searches for shorter paths for a short time.
+
+    Returns:
+        The result with the best valid motion, or the failed result.
     """
     request = context.request
     problem = context.problem

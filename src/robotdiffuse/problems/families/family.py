@@ -74,8 +74,14 @@ class SampledProblem:
     """Target pose of the tip. If the target is only a position, the first goal gives the orientation."""
 
     def problem(self, robot: Robot) -> Problem:
-        """The problem of reaching any of the goals, or a configuration full turns of joints away from a
-        goal."""
+        """Make the problem of reaching any of the goals, or a configuration whole turns of joints away.
+
+        Args:
+            robot: The robot for which the problem was drawn.
+
+        Returns:
+            The problem, with all goal configurations.
+        """
         goals = np.concatenate([robot.equivalent_configurations(goal, self.start) for goal in self.goals])
         return Problem(robot, self.scene, self.start, JointGoal(goals))
 
@@ -98,16 +104,33 @@ class Family(Protocol):
         ...
 
     def scene(self, rng: Generator, keep_out: Spheres | None = None) -> Scene:
-        """A random scene. keep_out: spheres (x, y, z, radius) that only the floor may intersect."""
+        """Draw a scene.
+
+        Args:
+            rng: Random generator.
+            keep_out: Spheres (x, y, z, radius) [n, 4] that only the floor may intersect [m]; None: none.
+
+        Returns:
+            The scene; the floor is its first shape, if the family has one.
+        """
         ...
 
     def draw(
         self, robot: Robot, rng: Generator, goals: int = 1, target: str = CONFIGURATION
     ) -> SampledProblem:
-        """A random problem with up to `goals` goals; the same state of `rng` gives the same problem.
+        """Draw a problem. Obstacles do not intersect the robot's fixed base.
 
-        Obstacles do not intersect the robot's fixed base, and start and goals are free of collision. Raises
-        InputError if no such problem was found for this robot.
+        Args:
+            robot: The robot.
+            rng: Random generator; the same state gives the same problem.
+            goals: Largest number of goal configurations.
+            target: What the goals reach: a "configuration", or a "position" or "pose" of the tip.
+
+        Returns:
+            The problem, with a start and goals that are free of collision.
+
+        Raises:
+            InputError: If no such problem was found for this robot.
         """
         ...
 
