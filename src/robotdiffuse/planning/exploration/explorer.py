@@ -209,7 +209,7 @@ class Explorer:
             configuration: The arm's present configuration [dof].
 
         Returns:
-            The step, which is to go to the goal, to look, done, or stuck with the reason.
+            A step of the kind `go`, `look`, `done` or `stuck`, with its motion and the reason.
 
         Raises:
             InputError: Before `set_goal`, and for values that are no configuration of the robot.
