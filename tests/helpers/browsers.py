@@ -12,7 +12,7 @@ FLAGS = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-backgrou
 FLAGS += ["--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 """WebGL without a graphics card."""
 MARKS = [pytest.mark.browser, pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")]
-"""Of tests that need it."""
+"""Marks of tests that need it."""
 PATIENCE = 300.0
 """A new machine compiles first, and WebGL without a graphics card is slow [s]."""
 

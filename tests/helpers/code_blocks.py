@@ -45,7 +45,7 @@ MARK = re.compile(r"^ *<!-- (file|needs|test): (.+?) -->\s*$")
 class Block:
     where: str
     line: int
-    """Of its first line of code, from 1."""
+    """Number of its first line of code, from 1."""
     language: str
     code: str
     marks: dict[str, str]

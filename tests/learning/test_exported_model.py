@@ -24,7 +24,7 @@ from robotdiffuse.perception.voxel_grid import SHAPE
 
 PANDA = rd.load_robot("panda")
 RELATIVE_TOLERANCE = 1e-5
-"""Of the largest number: fp32 rounds to 6e-8, and a network has some hundred roundings in a row."""
+"""As a fraction of the largest number: fp32 rounds to 6e-8, and a network has some hundred roundings in a row."""
 MAX_FILE_SIZE = 16e6
 
 

@@ -98,11 +98,11 @@ def test_what_went_away_becomes_free_and_old_evidence_is_forgotten() -> None:
     for _ in range(3):
         known.add(view_from(2.8, scene=rd.Scene([FLOOR])))
     assert known.free[middle]
-    ageing = OccupancyMap(PANDA, max_age=1.0)
-    ageing.add(view_from(2.8), stamp=10.0)
-    assert ageing.occupied[middle]
-    ageing.add(view_from(-1.4, scene=rd.Scene([FLOOR])), stamp=12.0)
-    assert not ageing.occupied[middle]
+    aging = OccupancyMap(PANDA, max_age=1.0)
+    aging.add(view_from(2.8), stamp=10.0)
+    assert aging.occupied[middle]
+    aging.add(view_from(-1.4, scene=rd.Scene([FLOOR])), stamp=12.0)
+    assert not aging.occupied[middle]
 
 
 def test_points_and_free_zones() -> None:

@@ -46,7 +46,7 @@ def test_what_spheres_call_free_is_free_and_little_else_is(name: str) -> None:
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_licenses_are_named(name: str) -> None:
-    assert name in NOTICE.lower() and read_source(DATA / name)["licence"]
+    assert name in NOTICE.lower() and read_source(DATA / name)["license"]
     assert sum(file.stat().st_size for file in (DATA / name).iterdir()) < 1_000_000
 
 

@@ -51,7 +51,7 @@ LINES = {"Content-Type": "application/x-ndjson"}
 PROMPT = 60.0
 """For an answer that must not wait for other requests [s]."""
 BRIEF = httpx.Timeout(60.0, read=0.5)
-"""Of a client that does not wait for its answer."""
+"""Time limit of a client that does not wait for its answer."""
 TRAJECTORY = ("joint_names", "times", "positions", "velocities", "accelerations")
 
 

@@ -15,7 +15,8 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.shapes import Box
 
-_ONE, _NO_BOX_CORNER = np.float32(1.0), np.float32(EMPTY_BOX[0, 0])
+_ONE = np.float32(1.0)
+_NO_BOX_CORNER = np.float32(EMPTY_BOX[0, 0])
 
 
 @inner_kernel()

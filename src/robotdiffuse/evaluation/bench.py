@@ -195,12 +195,12 @@ class PlannerProcess:
 # State and functions of the planner's process
 
 _planner: Planner
+# Further arguments of the planner's calls
 _request: Fields
-"""Further arguments of the planner's calls."""
+# Answers of the current run that have not been sent yet
 _answers: Iterator[Fields]
-"""Answers of the current run that have not been sent yet."""
+# Robots for which the planner has been warmed up
 _warm: set[Robot] = set()
-"""Robots for which the planner has been warmed up."""
 
 
 def _prepare(spec: PlannerSpec, log: str, cpu_time: bool) -> None:

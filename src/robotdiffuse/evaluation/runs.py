@@ -28,10 +28,11 @@ from robotdiffuse.problems.problem import Problem
 
 SOLVED = Status.SOLVED.value
 CRASHED = "crashed"
+"""Status of a record whose planner's process died. This status and the next two are not in `types.Status`."""
 OVERRAN = "overran"
+"""Status of a record whose planner did not answer in time."""
 RAISED = "exception"
-"""Statuses of records in addition to `types.Status`: the planner's process died (crashed), it did not answer
-in time (overran), or the planner raised an exception."""
+"""Status of a record whose planner raised an exception."""
 ENDED_EARLY = 0.9
 """A call that took less than this fraction of its time limit ended by itself: a longer limit would give the
 same result."""

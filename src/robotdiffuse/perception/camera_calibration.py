@@ -50,7 +50,7 @@ class CameraCalibration:
     covariance: Float[ndarray, "6 6"]
     """Covariance of the camera's position [m] and rotation vector [rad], in the base frame."""
     agreement: float
-    """Of the image cells that should show the arm, the fraction with the depth of the arm's model."""
+    """Fraction of the image cells that should show the arm whose depth is that of the arm's model."""
 
     @property
     def pose_deviation(self) -> tuple[float, float]:

@@ -51,11 +51,15 @@ by at least FLYING_PIXEL_WIDTHS widths of a pixel at its distance."""
 FLYING_PIXEL_WIDTHS = np.float32(4.0)
 BLOCK = 4
 """Edge of the blocks of voxels that are first tested as a whole [voxels]."""
-PIXEL_SLACK, DEPTH_SLACK = np.float32(0.01), np.float32(1e-4)
-"""Larger than the rounding errors of image coordinates [pixels] and of depths [m]."""
+PIXEL_SLACK = np.float32(0.01)
+"""Larger than the rounding errors of image coordinates [pixels]."""
+DEPTH_SLACK = np.float32(1e-4)
+"""Larger than the rounding errors of depths [m]."""
 FASTMATH = {"contract", "reassoc", "arcp", "nsz"}
 """All fastmath flags except those that assume finite numbers."""
-_HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
+_HALF = np.float32(0.5)
+_ONE = np.float32(1.0)
+_ZERO = np.float32(0.0)
 _NEAREST = np.float32(NEAREST)
 
 

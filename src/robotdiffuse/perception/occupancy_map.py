@@ -34,9 +34,10 @@ Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Low and high corner of a box [m]."""
 
 
-HIT, MISS = np.float32(3.0), np.float32(2.0)
-"""A view with points in a voxel adds HIT to the voxel's evidence; a view that sees the whole voxel free
-subtracts MISS."""
+HIT = np.float32(3.0)
+"""A view with points in a voxel adds this to the voxel's evidence."""
+MISS = np.float32(2.0)
+"""A view that sees the whole voxel free subtracts this."""
 MOST_EVIDENCE = np.float32(8.0)
 """Evidence is clipped to ± this, so that a few views suffice to change a voxel's state."""
 COVER_RADIUS = MAP.edge * 3**0.5 / 2

@@ -51,16 +51,20 @@ plus NOISES standard deviations of their noise."""
 NOISES = 3.0
 POINTS_PER_ERROR = 4
 """Number of points that count as one independent measurement."""
-KNOWN_ERROR, ARM_ERROR = 0.001, 0.004
-"""Standard deviations of the difference between a surface and its model: of the scene, and of the arm [m]."""
+KNOWN_ERROR = 0.001
+"""Standard deviation of the difference between a surface of the known scene and its model [m]."""
+ARM_ERROR = 0.004
+"""Standard deviation of the difference between the arm's surface and its model [m]."""
 ARM_OFFSET = 0.01
 """Standard deviation of the mean distance between the arm's surface and that of its model [m]."""
 FAR = 0.2
 """Surfaces farther from a point than this are not matched with it [m]."""
 OTHERS = 8
 """Number of nearest points among which a point of another image is searched for."""
-PRIOR_DEVIATIONS, DEVIATIONS = 1.5, 2.5
-"""Number of standard deviations in the `pose_deviation` that users state, and in that of a refined pose."""
+PRIOR_DEVIATIONS = 1.5
+"""Number of standard deviations in the `pose_deviation` that users state."""
+DEVIATIONS = 2.5
+"""Number of standard deviations in the `pose_deviation` of a refined pose."""
 MIN_DEVIATION = (0.002, 0.002)
 """Smallest deviation of a refined pose: position [m] and angle [rad]. No arm is more accurate."""
 IMPLAUSIBLE = 2.0

@@ -19,9 +19,11 @@ from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
-SAME_SURFACE_PIXELS, SAME_SURFACE_FRACTION = np.float32(4.0), np.float32(0.01)
+SAME_SURFACE_PIXELS = np.float32(4.0)
 """Neighboring pixels are on the same surface if their depths differ by less than this many widths of a pixel
-at that depth, or by less than this fraction of the depth."""
+at that depth, or as follows."""
+SAME_SURFACE_FRACTION = np.float32(0.01)
+"""Neighboring pixels are on the same surface if their depths differ by less than this fraction."""
 MAX_DEPTH = np.float32(1e6)
 """Larger depths are no returns [m]."""
 _NEAREST = np.float32(NEAREST)

@@ -165,9 +165,9 @@ class CrossedSpace:
     """Predicted probability that each voxel is occupied; None without a prediction."""
     grid: VoxelGrid = FINE
     lost_share: float = 0.0
-    """Of all voxels that the motion passes through, the share that is unknown, on rays without a return."""
+    """Fraction of the voxels on the motion that are unknown because their rays have no return."""
     unseen_share: float = 0.0
-    """Of all voxels that the motion passes through, the share that no view saw."""
+    """Fraction of the voxels on the motion that no view saw."""
 
     @cached_property
     def risk(self) -> float | None:

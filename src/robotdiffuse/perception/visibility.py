@@ -140,7 +140,8 @@ def _place(robot, q, margin, frames, arm):
 
 MAX_LOST_FRACTION = 0.2
 """Largest fraction of a ball's pixels without a return."""
-_HALF, _ZERO = np.float32(0.5), np.float32(0.0)
+_HALF = np.float32(0.5)
+_ZERO = np.float32(0.0)
 
 
 @kernel(nogil=True)

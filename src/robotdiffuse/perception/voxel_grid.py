@@ -89,8 +89,10 @@ class VoxelGrid:
         return out
 
 
-COARSE, FINE = VoxelGrid(LOW, SHAPE, VOXEL), VoxelGrid(LOW, FINE_SHAPE, FINE_VOXEL_SIZE)
-"""The voxels of the observed volume (4 cm), and voxels with half their edge (2 cm) in the same space."""
+COARSE = VoxelGrid(LOW, SHAPE, VOXEL)
+"""The voxels of the observed volume (4 cm)."""
+FINE = VoxelGrid(LOW, FINE_SHAPE, FINE_VOXEL_SIZE)
+"""Voxels with half the edge (2 cm) in the same space."""
 
 
 LAYERS_BELOW = 20

@@ -186,8 +186,8 @@ class _Session:
         return replace(self.planner.plan(problem, **vars(self.request)), problem=None)
 
 
+# What a worker process keeps between problems
 _state: tuple[_Session, list[Robot]] | None = None
-"""What a worker process keeps between problems."""
 
 
 def _prepare(loaded: PlannerArguments, robots: list[Robot], request: PlanRequest) -> None:

@@ -81,7 +81,8 @@ def _one_of(kinds: Schema) -> Schema:
     return _object(kinds) | {"minProperties": 1, "maxProperties": 1}
 
 
-NUMBERS, TEXTS = _array(NUMBER), _array(TEXT)
+NUMBERS = _array(NUMBER)
+TEXTS = _array(TEXT)
 ROWS = _array(NUMBERS)
 SHAPE, GOAL, POSE_OF_LINK = ({"$ref": f"#/$defs/{name}"} for name in ("shape", "goal", "pose"))
 VALUES: dict[str, Schema] = {

@@ -210,8 +210,8 @@ class Worker:
         self.end(patience)
 
 
+# Workers whose processes may run
 _started: "WeakSet[Worker]" = WeakSet()
-"""Workers whose processes may run."""
 
 
 def end_workers(workers: Iterable[Worker], patience: float) -> None:

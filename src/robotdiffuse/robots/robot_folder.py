@@ -60,7 +60,7 @@ def write_robot_folder(robot: Robot, folder: str | Path, source: dict[str, Any])
     """Write robot.json, meshes.npz and, for grazing links, surfaces.npz into a folder. Each file is written
     atomically; other files in the folder stay.
 
-    `source` describes the robot's origin by the keys urdf, sha256 and licence. If preparation measured them,
+    `source` describes the robot's origin by the keys urdf, sha256 and license. If preparation measured them,
     it also has `free`, the fraction of configurations that are free, and `refused`, the fraction of the free
     configurations in which covering spheres collide falsely. Raises InputError if the folder cannot be
     written.
@@ -172,7 +172,7 @@ def _to_json(robot: Robot, source: dict[str, Any]) -> dict:
         "format": FORMAT,
         "name": robot.name,
         "source": source,
-        "units": "metres, radians, seconds, kilograms; quaternions wxyz; spheres are x y z radius in the "
+        "units": "meters, radians, seconds, kilograms; quaternions wxyz; spheres are x y z radius in the "
         "link's frame; inertias are: mass; x y z of the center of mass; xx xy xz yy yz zz about it, along "
         "the link's axes",
         "base": robot.base,

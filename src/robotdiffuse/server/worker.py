@@ -76,8 +76,8 @@ class Cancelled(BaseException):
     """The call was cancelled."""
 
 
+# Robots that requests may name
 _robots: dict[str, Robot]
-"""Robots that requests may name."""
 _settings: ServeSettings
 _warm: set[tuple[str, str]] = set()
 

@@ -10,7 +10,8 @@ from robotdiffuse.collision.kernels.motions import distance, make_scratch, motio
 from robotdiffuse.collision.kernels.random import random
 from robotdiffuse.core.kernels import inner_kernel, kernel
 
-_ONE, _HALF = np.float32(1.0), np.float32(0.5)
+_ONE = np.float32(1.0)
+_HALF = np.float32(0.5)
 MAX_SUBDIVISIONS = 5
 """Largest number of subdivisions in a round of corner smoothing."""
 MIN_MOVE = np.float32(0.005)
@@ -18,12 +19,14 @@ MIN_MOVE = np.float32(0.005)
 joint-space L2]."""
 MIN_GAIN = np.float32(1e-3)
 """Simplification ends after a round that shortens the path by less than this fraction of its length."""
-REMOVE_SHARE, PULL_SHARE = np.float32(0.1), np.float32(0.35)
-"""Tightening draws a number from 0 to 1 for each attempt. Below REMOVE_SHARE, it removes a waypoint; below
-PULL_SHARE, it moves the waypoint towards the chord of its neighbors; otherwise it adds a random move."""
-MAX_RANDOM_MOVE, RANDOM_MOVE_LOG_RANGE = np.float32(0.3), np.float32(5.0)
-"""Largest scale of random moves of a waypoint, in each joint [rad], and the natural logarithm of the ratio of
-the largest to the smallest scale."""
+REMOVE_SHARE = np.float32(0.1)
+"""Tightening draws a number from 0 to 1 for each attempt. Below this number, it removes a waypoint."""
+PULL_SHARE = np.float32(0.35)
+"""Below this number, tightening moves a waypoint towards the chord of its neighbors; above it, at random."""
+MAX_RANDOM_MOVE = np.float32(0.3)
+"""Largest scale of random moves of a waypoint, in each joint [rad]."""
+RANDOM_MOVE_LOG_RANGE = np.float32(5.0)
+"""Natural logarithm of the ratio of the largest to the smallest scale of random moves."""
 
 
 @kernel(nogil=True)

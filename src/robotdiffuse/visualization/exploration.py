@@ -199,7 +199,7 @@ def write_exploration_picture(explorer: RecordedExplorer, scene: Scene, file: st
 
     The picture of a moment shows the arm's motion and what was known when it was chosen: voxels seen occupied
     (blue), predicted voxels (violet), the boundary of unknown space (gray, see-through), and for the kind
-    `look` the camera's view pyramid at its end. `scene` is the true scene; it is used only to choose the view.
+    `look` the camera's view pyramid at its end. `scene` is the true scene, used only to choose the view.
     Raises InputError for a file name with another ending, or a file that cannot be written.
     """
     path = check_output(file, (".png",))

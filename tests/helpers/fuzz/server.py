@@ -34,9 +34,9 @@ call, and its grace."""
 START_LIMIT = 60.0
 """The same for the first requests, which load compiled code [s]."""
 INPUTS_BETWEEN_CHECKS = 50
-"""Of the server itself, on average."""
+"""Number of inputs between two checks of the server, on average."""
 MAX_MEMORY_GROWTH = 48 * 2**20
-"""Of the server and its workers since its first checks [bytes]."""
+"""Largest growth of the memory of the server and its workers since the first checks [bytes]."""
 SETTLING_CHECKS = 3
 """Checks before memory must stop growing."""
 TOKEN = "open sesame"

@@ -27,7 +27,9 @@ from robotdiffuse.robots.frame_kernel import cross, dot, length, minus, plus, ti
 
 CLEARANCE_CAP = np.float32(1.0)
 """Larger clearances are capped at this value [m]."""
-_ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
+_ZERO = np.float32(0.0)
+_HALF = np.float32(0.5)
+_ONE = np.float32(1.0)
 _TINY = np.float32(1e-9)
 
 

@@ -41,7 +41,10 @@ from robotdiffuse.collision.kernels.simd import (
 from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 from robotdiffuse.robots.frame_kernel import cross, dot, minus, plus, times
 
-_ZERO, _ONE, _TINY, _FAR = np.float32(0.0), np.float32(1.0), np.float32(1e-9), np.float32(1e9)
+_ZERO = np.float32(0.0)
+_ONE = np.float32(1.0)
+_TINY = np.float32(1e-9)
+_FAR = np.float32(1e9)
 
 
 class ClearanceWorkspace(NamedTuple):

@@ -48,7 +48,8 @@ TABLE_HEADER = 6
 TABLE_SIDE = 130
 ALL_LANES = (1 << W) - 1
 """The mask of all lanes."""
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_ZERO = np.float32(0.0)
+_ONE = np.float32(1.0)
 # sin(2 pi u) for |u| <= 1/4: Taylor coefficients, error below 6e-8
 _S1 = np.float32(6.283185307179586)
 _S3 = np.float32(-41.341702240399755)

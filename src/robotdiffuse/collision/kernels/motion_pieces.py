@@ -89,13 +89,13 @@ def _cut(ends, start, stop, travel):
 def first_pieces(motion, checks, travel):
     """The initial pieces: one of length zero at the start, then pieces with a motion bound of at most
     `travel` [m]. A piece also ends where the direction changes by more than STRAIGHT_COSINE allows."""
-    q, travelled = motion
+    q, traveled = motion
     n, dof = q.shape
     ends = [0.0]
     last = 0.0
     before = -1
     for i in range(1, n):
-        if travelled[i] <= travelled[i - 1]:
+        if traveled[i] <= traveled[i - 1]:
             continue
         # cosine of the angle between this segment and the previous one
         dot = 1.0
@@ -112,11 +112,11 @@ def first_pieces(motion, checks, travel):
                 a = a + u * u
                 b = b + v * v
         if dot < STRAIGHT_COSINE * np.sqrt(a * b):
-            _cut(ends, last, travelled[i - 1], travel)
-            last = travelled[i - 1]
+            _cut(ends, last, traveled[i - 1], travel)
+            last = traveled[i - 1]
         before = i - 1
-    if travelled[n - 1] > last:
-        _cut(ends, last, travelled[n - 1], travel)
+    if traveled[n - 1] > last:
+        _cut(ends, last, traveled[n - 1], travel)
     start = np.empty(len(ends))
     stop = np.empty(len(ends))
     for k in range(len(ends)):

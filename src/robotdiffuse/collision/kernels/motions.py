@@ -9,7 +9,8 @@ from robotdiffuse.collision.kernels.lane_collision import block_hits, make_works
 from robotdiffuse.collision.kernels.simd import W, lane_numbers, store
 from robotdiffuse.core.kernels import allocation_free, kernel
 
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_ZERO = np.float32(0.0)
+_ONE = np.float32(1.0)
 RELAXATION_SLOPE = np.float32(0.1)
 """If a start or goal is closer to the scene than the padding, the padding is reduced at this configuration
 and grows by this much per radian of distance from it [m/rad]."""

@@ -5,11 +5,12 @@ import numpy as np
 
 from robotdiffuse.core.kernels import allocation_free, kernel
 
+# Squared distance that stands for infinity, in lines without any points [voxels²]
 _NO_POINTS = np.int32(1 << 30)
-"""Squared distance that stands for infinity, in lines without any points [voxels²]."""
+# Added before a position along a line is rounded down [voxels]: more than its rounding error, less than
+# the distance of such a position, a fraction with a small denominator, from the next integer unless it is
+# one
 _ROUNDING_SLACK = 1e-6
-"""Added before a position along a line is rounded down [voxels]: more than its rounding error, less than the
-distance of such a position, a fraction with a small denominator, from the next integer unless it is one."""
 
 
 @kernel(fastmath=True)

@@ -41,8 +41,8 @@ _ONE = np.float32(1.0)
 _HALF = np.float32(0.5)
 _MIDDLE = _HALF, _HALF, _HALF
 _TINY = np.float32(1e-9)
+# Upper bound on the rounding error of a distance within the grid [m]
 _SLACK = np.float32(1e-5)
-"""Upper bound on the rounding error of a distance within the grid [m]."""
 
 
 @kernel(fastmath=True)

@@ -26,7 +26,8 @@ W = 16
 """Number of lanes. It is also the number of configurations in a block, and of spheres or obstacles in a
 row."""
 _FLAGS = ("nnan", "nsz", "contract")
-_FLOAT, _BITS = ir.FloatType(), ir.IntType(64)
+_FLOAT = ir.FloatType()
+_BITS = ir.IntType(64)
 _VECTOR = ir.VectorType(_FLOAT, W)
 _INTEGERS = ir.VectorType(ir.IntType(32), W)
 _EVERYWHERE = ir.Constant(_INTEGERS, [0] * W)

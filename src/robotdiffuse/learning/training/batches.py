@@ -106,8 +106,8 @@ class TrajectoryData:
         )
 
 
+# Trajectories, their scenes, whether each trajectory is trivial, and the embeddings of the scenes
 _Part = tuple[ndarray, PackedScenes, ndarray, ndarray]
-"""Trajectories, their scenes, whether each trajectory is trivial, and the embeddings of the scenes."""
 
 
 def load_data(

@@ -85,7 +85,8 @@ from robotdiffuse.validation.tolerances import VerifySettings, goal_error
 PROBABILITY_BELOW = np.float32(0.1)
 """Assumed probability that an unknown voxel below the network's volume is occupied. About this share of the
 unknown voxels within reach is occupied."""
-NOTHING, DEFAULTS = Scene(()), ExplorerSettings()
+NOTHING = Scene(())
+DEFAULTS = ExplorerSettings()
 QUICK_FRACTION = 0.2
 """Fraction of the time limit that a search gets if a view or another search may follow. For searches within
 space seen free, it doubles with each view: the more space was seen, the likelier is a motion."""
@@ -156,7 +157,7 @@ class Explorer:
         self._news: list[DepthView] = []
         """Views since the latest step."""
         self._beside: DepthView | None = None
-        """Of the views before the latest step, the last one by a camera that is not on the arm."""
+        """The last view before the latest step by a camera that is not on the arm."""
         self._free = self.map.free
         """Voxels that were free at the latest step."""
 

@@ -20,13 +20,15 @@ from robotdiffuse.collision.kernels.random import random
 from robotdiffuse.collision.kernels.simd import W, lane, load
 from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
-_ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+_ZERO = np.float32(0.0)
+_ONE = np.float32(1.0)
+_HALF = np.float32(0.5)
 _TAU = np.float32(6.283185307179586)
 INFINITE = np.float32(np.inf)
+# Coordinate of unused node places, far from all nodes; its square is finite [rad]
 _NOWHERE = np.float32(1e15)
-"""Coordinate of unused node places, far from all nodes; its square is finite [rad]."""
+# A squared distance that is larger than those of nodes and smaller than those of unused places [rad²]
 _FAR = np.float32(1e29)
-"""A squared distance that is larger than those of nodes and smaller than those of unused places [rad²]."""
 LINE_SHARE = np.float32(0.5)
 """While there is no path: fraction of the samples that are drawn around the straight line from start to goal;
 the other samples are uniform."""

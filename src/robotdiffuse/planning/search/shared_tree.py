@@ -50,7 +50,8 @@ from robotdiffuse.planning.search.rrt_kernel import INFINITE, add, nearest_few, 
 from robotdiffuse.planning.start_goal import StartGoal, falling_clearances, padded_space
 from robotdiffuse.trajectories.simplification import simplify, tighten
 
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_ZERO = np.float32(0.0)
+_ONE = np.float32(1.0)
 CAPACITY = 500_000
 """Largest number of nodes of the tree. The operating system allocates their memory only when it is used."""
 GOAL_BIAS = np.float32(0.1)

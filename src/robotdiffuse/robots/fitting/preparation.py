@@ -635,7 +635,7 @@ def add_robot(
         if semantics is not None and (pair.reason == "checked") == (frozenset(pair.links) in srdf_allowed)
     )
     folder = user_robots() / name if out is None else Path(out)
-    source = {"urdf": Path(urdf).name, "sha256": tree.digest, "licence": license}
+    source = {"urdf": Path(urdf).name, "sha256": tree.digest, "license": license}
     shares = {"free": round(measured.free, 4), "refused": round(measured.by_spheres, 4)}
     note = (
         f"{measured.free:.1%} of the configurations are free of self-collision; convex parts "
