@@ -8,7 +8,9 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import util
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -42,6 +44,28 @@ def test_a_single_worker_is_replaced_when_it_dies_or_is_ended(worker: Worker) ->
     worker.close()
     with pytest.raises(EndedError, match="closed"):
         worker.call(os.getpid)
+
+
+def test_closing_waits_for_a_process_that_is_starting(worker: Worker, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: after Ctrl-C, the program exited between the start of a worker and the message that says what to run, and
+    the worker printed a traceback."""
+    begun, spawn = threading.Event(), util.spawnv_passfds
+    pids: list[int] = []
+
+    def slowly(*arguments: Any) -> int:
+        pids.append(spawn(*arguments))
+        begun.set()
+        time.sleep(0.5)
+        return pids[0]
+
+    monkeypatch.setattr(util, "spawnv_passfds", slowly)
+    with ThreadPoolExecutor(1) as threads:
+        sent = threads.submit(worker.call, os.getpid)
+        assert begun.wait(HELD)
+        worker.close(0.0)
+        assert not Path(f"/proc/{pids[0]}").exists()
+        with pytest.raises(EndedError, match="closed"):
+            sent.result(HELD)
 
 
 def wait_until_cancelled() -> None:

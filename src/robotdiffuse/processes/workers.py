@@ -27,6 +27,7 @@ from typing import Any
 from weakref import WeakSet
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.interrupts import delay_interrupts
 from robotdiffuse.core.registry import added_entries, adopt_entries
 
 Results = Generator[tuple[int, Any], None, None]
@@ -104,6 +105,8 @@ class Worker:
         self._prepare = prepare
         self._arguments = arguments
         self._running: tuple[BaseProcess, Connection] | None = None
+        self._starting = threading.Lock()
+        """Held while the process starts; if this one exited then, the new one would print a traceback."""
         self._number = 0
         """Number of the last call in the process."""
         self._closed = False
@@ -125,14 +128,14 @@ class Worker:
         _check_script()
         connection, child_end = _SPAWN.Pipe()
         process = _SPAWN.Process(target=_main, args=(child_end,))
-        with block_interrupts_in_children():
-            process.start()
-        child_end.close()
-        self._running = (process, connection)
-        self._number = 0
         _started.add(self)
-        if self._closed:  # meanwhile, by another thread
-            self.end(0.0)
+        with delay_interrupts(), self._starting, block_interrupts_in_children():
+            if self._closed:  # meanwhile, by another thread
+                raise EndedError("closed")
+            process.start()
+            child_end.close()
+            self._running = (process, connection)
+            self._number = 0
         try:
             connection.recv()  # writing before would block forever if the process ends
         except (EOFError, OSError):
@@ -218,8 +221,9 @@ def end_workers(workers: Iterable[Worker], patience: float) -> None:
     """End the processes of workers together; see `Worker.end`."""
     processes = []
     for worker in workers:
-        running = worker._running
-        worker._running = None
+        with worker._starting:
+            running = worker._running
+            worker._running = None
         worker.ready = False
         processes += [] if running is None else [running[0]]
     for process in processes:
@@ -234,7 +238,8 @@ def end_workers(workers: Iterable[Worker], patience: float) -> None:
 
 @atexit.register
 def _end_all() -> None:
-    end_workers(list(_started), 0.0)
+    for worker in list(_started):
+        worker.close(0.0)
 
 
 class Call(Future):
@@ -466,12 +471,14 @@ def _main(connection: Connection) -> None:
     _exit_by_signal_with_parent()
     _this = _Process(connection)
     threading.Thread(target=_this.receive, daemon=True).start()
-    _this.send(0.0)  # the message for which `Worker._start` waits
     try:
+        _this.send(0.0)  # the message for which `Worker._start` waits
         _, message = _this.calls.get()
         entries, prepare, arguments = pickle.loads(message)
         adopt_entries(entries)
         _this.send(pickle.dumps((prepare(*arguments), None)))
+    except BrokenPipeError:  # the parent has died
+        os._exit(1)
     except BaseException:  # it could not run any call
         traceback.print_exc()
         sys.stderr.flush()
