@@ -161,8 +161,8 @@ def test_files_that_are_none(tmp_path: Path) -> None:
         (tmp_path / "none", "does not exist"),
         (tmp_path / "latin" / "below", "cannot be read: Not a directory"),
         (tmp_path / "latin", "is not UTF-8 text: byte 2"),
-        ("a\0b", "no file can have this name"),
-        ("\ud800", "no file can have this name"),
+        ("a\0b", "not a valid file name"),
+        ("\ud800", "not a valid file name"),
         ("x" * 1000, "File name too long"),
     ]:
         assert message in one_line(lambda file=file: read_text(file, "robot file"))

@@ -330,21 +330,21 @@ def test_the_range_of_a_camera_is_a_positive_number(far: float) -> None:
 
 def test_steps_and_views_are_kept_with_their_times() -> None:
     problem, explorer, _ = recorded()
-    acts = explorer.acts
-    assert len(acts) >= 2 and acts[-1].step.motion is None and explorer.duration == acts[-1].begins
-    np.testing.assert_array_equal(acts[0].configuration, problem.start)
-    for before, after in pairwise(acts):
+    steps = explorer.steps
+    assert len(steps) >= 2 and steps[-1].step.motion is None and explorer.duration == steps[-1].begins
+    np.testing.assert_array_equal(steps[0].configuration, problem.start)
+    for before, after in pairwise(steps):
         assert after.begins == before.begins + before.duration
         assert before.trajectory is not None
         np.testing.assert_allclose(before.trajectory.positions[-1], after.configuration, atol=1e-9)
     times = [view.time for view in explorer.views]
     assert times == sorted(times) and times[-1] == explorer.duration
     for view in explorer.views:
-        act = acts[view.act]
-        assert view.act < 0 or act.begins < view.time <= act.begins + act.duration
+        record = steps[view.step_index]
+        assert view.step_index < 0 or record.begins < view.time <= record.begins + record.duration
     assert [view.camera for view in explorer.views[:2]] == [None, 0], "that beside the arm, then its own"
-    assert any(act.step.kind == "look" for act in acts)
-    assert all((act.T_base_camera is not None) == (act.step.kind == "look") for act in acts)
+    assert any(record.step.kind == "look" for record in steps)
+    assert all((record.T_base_camera is not None) == (record.step.kind == "look") for record in steps)
 
 
 FROM, TO = (np.array([turn, *HOME[1:]]) for turn in (1.0, -0.9))

@@ -85,12 +85,14 @@ def test_the_page_holds_what_was_known_at_each_time(page: Path) -> None:
     told = data["exploration"]
     assert [shape["name"] for shape in data["scene"]] == [FLOOR.name]
     assert [shape["name"] for shape in told["true_scene"]] == ["floor", "wall"]
-    assert len(told["acts"]) == len(explorer.acts)
-    for number, (act, one) in enumerate(zip(explorer.acts, told["acts"], strict=True)):
-        assert one["time"] == pytest.approx(act.begins + number * exploration.READING_TIME, abs=1e-3)
-        assert one["title"].startswith(f"{number + 1}  ") and one["reason"] == act.step.reason
-        assert bool(one["look"]) == (act.T_base_camera is not None) == (one["end"] is not None)
-    assert data["times"][-1] == pytest.approx(explorer.duration + exploration.READING_TIME * (len(explorer.acts) - 1), abs=1e-3)
+    assert len(told["steps"]) == len(explorer.steps)
+    for number, (record, one) in enumerate(zip(explorer.steps, told["steps"], strict=True)):
+        assert one["time"] == pytest.approx(record.begins + number * exploration.READING_TIME, abs=1e-3)
+        assert one["title"].startswith(f"{number + 1}  ") and one["reason"] == record.step.reason
+        assert bool(one["look"]) == (record.T_base_camera is not None) == (one["end"] is not None)
+    assert data["times"][-1] == pytest.approx(
+        explorer.duration + exploration.READING_TIME * (len(explorer.steps) - 1), abs=1e-3
+    )
     times = [known["time"] for known in told["known"]]
     assert times == sorted(times) and times[0] == 0.0
     unknown: set[int] = set()
@@ -114,7 +116,7 @@ def test_a_browser_shows_the_steps(page: Path) -> None:
         names = "[...document.querySelectorAll('#toggles button')].map((b) => b.textContent)"
         toggles = shown.evaluate(names)
         pixels = shown.evaluate("layers.map((layer) => layer.meshes[0].geometry.index.count)")
-    assert not errors and rows == ["false"] * (len(explorer.acts) - 1) + ["true"]
+    assert not errors and rows == ["false"] * (len(explorer.steps) - 1) + ["true"]
     assert toggles[:5] == ["Occupied", "Predicted", "Unknown", "Next view", "True scene"]
     assert np.array(pixels)[[0, 2]].min() > 6000
 

@@ -72,7 +72,7 @@ def explore_shelf(problem: Problem, outputs: list[Path]) -> int:
     problem = Problem(problem.robot, Scene([FLOOR, *obstacles]), start, problem.goal)
     print("The arm knows the floor. A camera at its tip and one beside it observe the rest.")
     explorer, arrived = simulate(problem, ExplorerSettings(time_limit=EXPLORE_TIME_LIMIT), None, 0)
-    views = sum(act.step.kind == LOOK for act in explorer.acts)
+    views = sum(record.step.kind == LOOK for record in explorer.steps)
     end = "is at the goal" if arrived else "is not at the goal"
     images = len(explorer.views)
     print(f"The arm {end}: {views} motions to viewpoints, {images} images, {explorer.duration:.1f} s.")

@@ -210,7 +210,9 @@ def rigid_transform(what: str, value: object, slack: float = RIGID_SLACK) -> nda
     rotation = T[:3, :3]
     off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(T[3] - LAST_ROW).max())
     if off > slack or np.linalg.det(rotation) < 0:
-        raise InputError(f"{what} is {shown(T)}; it must be a rotation and a translation over a row 0 0 0 1")
+        raise InputError(
+            f"{what} is {shown(T)}; it must be a homogeneous transform with the last row 0 0 0 1"
+        )
     T[3] = LAST_ROW
     return T
 

@@ -94,7 +94,7 @@ def input_file(file: str | Path, what: str = "", largest: int = MAX_FILE_SIZE) -
     except OSError as error:
         raise InputError(f"{named} cannot be read: {error.strerror}") from None
     except ValueError:  # a NUL or half a surrogate pair in the name
-        raise InputError(f"{named} cannot be read: no file can have this name") from None
+        raise InputError(f"{named} is not a valid file name") from None
     if not stat.S_ISREG(status.st_mode):
         kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device or a pipe"
         raise InputError(f"{named} cannot be read: it is {kind}; it must be a file")
@@ -209,7 +209,9 @@ def parse_yaml(text: str, where: str) -> Any:
     except yaml.YAMLError as error:
         raise InputError(f"{where} is not valid YAML: {_reason(error)}") from None
     except UnicodeEncodeError:
-        raise InputError(f"{where} is not valid YAML: it holds half of a surrogate pair") from None
+        raise InputError(
+            f"{where} is not valid YAML: it contains invalid Unicode (an unpaired surrogate)"
+        ) from None
 
 
 def parse_xml(text: bytes, where: str) -> ET.Element:

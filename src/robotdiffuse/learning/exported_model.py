@@ -76,7 +76,8 @@ class ExportedModel(MotionModel):
                 f"{location} names the ONNX files {sorted(parts)}; it must name {sorted(needed)}"
             )
         networks = {ending: OnnxNetwork(data, f"{folder / name}{ending}") for ending, data in parts.items()}
-        self._denoiser, self._encoder = networks[".onnx"], networks.get(".encoder.onnx")
+        self._denoiser = networks[".onnx"]
+        self._encoder = networks.get(".encoder.onnx")
         initial = Statistics.without_data(self.waypoints, self.dof)
         self._statistics = initial._replace(**read_arrays(folder, name, about, Statistics._fields))
         # networks and statistics must fit the description

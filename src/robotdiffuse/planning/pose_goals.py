@@ -30,7 +30,7 @@ ROUND = InverseKinematicsSettings(seeds_per_round=SEEDS, max_rounds=1)
 MAX_ROUNDS = 64
 PATIENCE = 2
 REACH_ROUNDS = 16
-TOLERANCE_FRACTION = 0.9
+GOAL_TOLERANCE_FRACTION = 0.9
 """Fraction of the tolerances of goal poses and path constraints that goal configurations use."""
 MIN_DIFFERENCE = 0.1
 """Two configurations count as different if at least one joint differs by more than this [rad] or [m]."""
@@ -93,7 +93,7 @@ def pose_configurations(
         solutions = [np.concatenate([before, more]) for before, more in zip(solutions, new, strict=True)]
         seeds = new[0] if len(poses) == 1 else _combined(problem, poses, solutions, rng)
         if len(poses) > 1 or problem.constraints:
-            seeds = all_constraints.projected(np.concatenate([start[None], seeds]), TOLERANCE_FRACTION)
+            seeds = all_constraints.projected(np.concatenate([start[None], seeds]), GOAL_TOLERANCE_FRACTION)
         reached = reached or len(seeds) > 0
         accepted = _accepted(robot.nearest_turns(seeds, start), accept)
         before = len(configurations)
@@ -126,7 +126,7 @@ def at_pose(
     seeds = np.where(on_other_arm(robot, pose.frame), start, seeds)
     seeds[0] = start
     pose_constraints = PathConstraints(replace(problem, constraints=()), [pose], exact)
-    return pose_constraints.projected(seeds, TOLERANCE_FRACTION, count)
+    return pose_constraints.projected(seeds, GOAL_TOLERANCE_FRACTION, count)
 
 
 def at_poses(
@@ -173,7 +173,7 @@ def _pulled(constraints: PathConstraints, q: Configurations, start: Configuratio
     robot = constraints.robot
     nearest = q
     for _ in range(MAX_PULLS):
-        moved, reached = constraints.project(nearest + PULL * (start - nearest), TOLERANCE_FRACTION)
+        moved, reached = constraints.project(nearest + PULL * (start - nearest), GOAL_TOLERANCE_FRACTION)
         moved = robot.nearest_turns(moved, start)
         before = np.linalg.norm(nearest - start, axis=1)
         nearer = reached & (np.linalg.norm(moved - start, axis=1) < (1 - MIN_PULL_GAIN) * before)

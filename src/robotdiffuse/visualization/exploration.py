@@ -1,7 +1,6 @@
 """Pictures and pages of an exploration: what was known about the scene over time, and the steps of the arm.
 
-The planner calls a step of an exploration an act (`RecordedAct`). A step of the kind `look` moves the arm to
-take a view with its camera.
+A step of the kind `look` moves the arm to take a view with its camera.
 """
 
 from collections import Counter
@@ -20,7 +19,7 @@ from robotdiffuse.core.types import Mask, Path, Points, Trajectory
 from robotdiffuse.drawables import ASSUMED, OBSERVED, Color, Surface, drawables, painted
 from robotdiffuse.perception.seen_points import near_scene
 from robotdiffuse.perception.voxel_grid import MAP
-from robotdiffuse.planning.exploration.simulated import RecordedAct, RecordedExplorer, RecordedView
+from robotdiffuse.planning.exploration.simulated import RecordedExplorer, RecordedStep, RecordedView
 from robotdiffuse.planning.exploration.steps import DONE, LOOK
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.visualization.arm import DrawnArm
@@ -80,7 +79,7 @@ class Moment:
 
     number: int
     """Number of the step, counted from 1."""
-    act: RecordedAct
+    record: RecordedStep
     """The step."""
     views: list[RecordedView]
     """The last view before the step, then the views that were taken during its motion."""
@@ -100,35 +99,35 @@ def shares(known: RecordedView) -> list[tuple[str, str]]:
 def moments(explorer: RecordedExplorer) -> list[Moment]:
     """The moments of all steps before which there was a view, in order."""
     recorded = []
-    for number, act in enumerate(explorer.acts):
-        before = [view for view in explorer.views if view.act < number]
-        during = [view for view in explorer.views if view.act == number]
+    for number, record in enumerate(explorer.steps):
+        before = [view for view in explorer.views if view.step_index < number]
+        during = [view for view in explorer.views if view.step_index == number]
         if before:
-            recorded.append(Moment(number + 1, act, [before[-1], *during]))
+            recorded.append(Moment(number + 1, record, [before[-1], *during]))
     return recorded
 
 
-def title(act: RecordedAct) -> str:
+def title(record: RecordedStep) -> str:
     """The name of a step, with the duration of its motion."""
-    step = act.step
-    duration = act.duration
+    step = record.step
+    duration = record.duration
     name = {DONE: "at the goal"}.get(step.kind, step.kind)
     return f"{name} ({duration:.1f} s)" if duration else name
 
 
 def shown_voxels(
-    view: RecordedView, act: RecordedAct | None, in_known_scene: Voxels
+    view: RecordedView, record: RecordedStep | None, in_known_scene: Voxels
 ) -> tuple[tuple[Voxels, Voxels], ...]:
     """The layers to show after a view: occupied, predicted (unknown, and probably occupied) and unknown
     voxels.
 
     A layer is a pair of voxel sets, inside and outside; the faces between both sets are shown. The prediction
-    is that of `act`; without an act there is none. Voxels in the scene that is known without views are left
-    out.
+    is that of `record`; without a record there is none. Voxels in the scene that is known without views are
+    left out.
     """
     occupied = view.occupied & ~in_known_scene
     unknown = view.unknown & ~in_known_scene
-    probability = None if act is None else act.predicted
+    probability = None if record is None else record.predicted
     predicted = np.zeros_like(unknown) if probability is None else unknown & (probability > LIKELY)
     return (occupied, ~occupied), (predicted, ~predicted), (unknown, view.free)
 
@@ -139,17 +138,17 @@ def in_known_scene(explorer: RecordedExplorer) -> Voxels:
     return near_scene(explorer.robot, explorer.scene, centers, MAP.edge).reshape(MAP.shape)
 
 
-def frustum(explorer: RecordedExplorer, act: RecordedAct) -> list[Points]:
+def frustum(explorer: RecordedExplorer, record: RecordedStep) -> list[Points]:
     """The edges of the view pyramid of the arm's first camera at a viewpoint, as polylines in the base
     frame [m]; an empty list for other steps."""
-    if act.T_base_camera is None:
+    if record.T_base_camera is None:
         return []
     camera = explorer.cameras[0]
     fx, fy, cx, cy = camera.intrinsics
     width, height = camera.size
     corners = np.array([(0, 0), (width, 0), (width, height), (0, height)], float)
     in_camera = np.column_stack([(corners - (cx, cy)) / (fx, fy), np.ones(4)]) * FRUSTUM_DEPTH
-    T = act.T_base_camera
+    T = record.T_base_camera
     rim = placed(T, in_camera)
     return [np.stack([T[:3, 3], corner]) for corner in rim] + [np.concatenate([rim, rim[:1]])]
 
@@ -205,7 +204,7 @@ def write_exploration_picture(explorer: RecordedExplorer, scene: Scene, file: st
     path = check_output(file, (".png",))
     all_moments = moments(explorer)
     chosen = _chosen(len(all_moments))
-    waypoints = np.concatenate([moment.act.waypoints for moment in all_moments])
+    waypoints = np.concatenate([moment.record.waypoints for moment in all_moments])
     size = TILE.width, TILE.height
     camera = view_of_motion(DrawnArm(explorer.robot), drawables(scene), waypoints, size, MARGINS)
     in_scene = in_known_scene(explorer)
@@ -223,8 +222,8 @@ def _chosen(count: int) -> list[int]:
 
 def _tile(explorer: RecordedExplorer, moment: Moment, known: Voxels, camera: Camera) -> Image.Image:
     robot = explorer.robot
-    act = moment.act
-    layers = shown_voxels(moment.known, act, known)
+    record = moment.record
+    layers = shown_voxels(moment.known, record, known)
     occupied, predicted, unknown = (
         faces_surface(*pair, color) for pair, color in zip(layers, (OBSERVED, WHITE, WHITE), strict=True)
     )
@@ -232,18 +231,18 @@ def _tile(explorer: RecordedExplorer, moment: Moment, known: Voxels, camera: Cam
         ClearSurface(unknown, linear(UNKNOWN), UNKNOWN_ALPHA),
         ClearSurface(predicted, linear(ASSUMED), PREDICTED_ALPHA),
     ]
-    look = [tube(edge, LOOK_COLOR, LOOK_COLOR) for edge in frustum(explorer, act)]
-    motion = act.trajectory or Path(robot.joint_names, act.waypoints)
+    look = [tube(edge, LOOK_COLOR, LOOK_COLOR) for edge in frustum(explorer, record)]
+    motion = record.trajectory or Path(robot.joint_names, record.waypoints)
     pixels = render(robot, explorer.scene, motion, TILE, camera, added=(occupied, *look), clear=clear)
     image = Image.fromarray(faded_below(pixels, *FADE))
     legend = {
         "occupied": OBSERVED,
-        **({} if act.predicted is None else {"predicted": ASSUMED}),
+        **({} if record.predicted is None else {"predicted": ASSUMED}),
         **({"next look": LOOK_COLOR} if look else {}),
     }
     facts = [*shares(moment.known), *((name, "") for name in legend)]
     colors = (*SHARE_COLORS, *legend.values())
-    caption(image, f"{moment.number}  {title(moment.act)}", facts, colors, CAPTION_SIZE)
+    caption(image, f"{moment.number}  {title(moment.record)}", facts, colors, CAPTION_SIZE)
     return image
 
 
@@ -275,12 +274,12 @@ def write_exploration(explorer: RecordedExplorer, scene: Scene, file: str | File
         "layers": LAYERS,
         "look_color": LOOK_COLOR,
         "known": _known(explorer),
-        "acts": [_act(explorer, moment) for moment in moments(explorer)],
+        "steps": [_step(explorer, moment) for moment in moments(explorer)],
         "true_scene": data["scene"],
     }
     data["scene"] = page_shapes(explorer.scene)
-    last = explorer.acts[-1].step
-    kinds = Counter(act.step.kind for act in explorer.acts)
+    last = explorer.steps[-1].step
+    kinds = Counter(record.step.kind for record in explorer.steps)
     data["facts"] = [
         ("status", "solved" if last.kind == DONE else last.kind),
         ("policy", explorer.settings.policy.replace("_", " ")),
@@ -291,22 +290,22 @@ def write_exploration(explorer: RecordedExplorer, scene: Scene, file: str | File
     write_atomically(target, page_text(f"{robot.name} · exploration", data, "exploration.js"))
 
 
-def _page_time(time: float, act: int) -> float:
+def _page_time(time: float, number: int) -> float:
     """Time on the page, where each step begins with a pause, of a `time` during the step with this index
     [s]."""
-    return round(time + READING_TIME * (act + 1), 4)
+    return round(time + READING_TIME * (number + 1), 4)
 
 
 def _whole_motion(explorer: RecordedExplorer) -> Trajectory:
     """The motions of all steps as one trajectory, with the pauses between them."""
     times = []
     positions = []
-    for number, act in enumerate(explorer.acts):
-        times.append(np.array([_page_time(act.begins, number - 1)]))
-        positions.append(act.configuration[None])
-        if act.trajectory is not None:
-            times.append(_page_time(act.begins, number) + act.trajectory.times)
-            positions.append(act.trajectory.positions)
+    for number, record in enumerate(explorer.steps):
+        times.append(np.array([_page_time(record.begins, number - 1)]))
+        positions.append(record.configuration[None])
+        if record.trajectory is not None:
+            times.append(_page_time(record.begins, number) + record.trajectory.times)
+            positions.append(record.trajectory.positions)
     q = np.concatenate(positions)
     return Trajectory(explorer.robot.joint_names, np.concatenate(times), q, 0 * q, 0 * q)
 
@@ -318,11 +317,11 @@ def _known(explorer: RecordedExplorer) -> list[dict[str, Any]]:
     before = [np.zeros(0, np.int64) for _ in LAYERS]
     states = []
     for moment in moments(explorer):
-        act = moment.act
+        record = moment.record
         for i, view in enumerate(moment.views):
             number = moment.number - 1
-            time = _page_time(view.time, number) if i else _page_time(act.begins, number - 1)
-            layers = shown_voxels(view, act, known_scene)
+            time = _page_time(view.time, number) if i else _page_time(record.begins, number - 1)
+            layers = shown_voxels(view, record, known_scene)
             after = [faces_between(*pair)[0] for pair in layers]
             changed = [np.setxor1d(a, b) for a, b in zip(before, after, strict=True)]
             states.append({"time": time, "layers": [_packed(faces) for faces in changed]})
@@ -340,15 +339,15 @@ def _packed(numbers: Int[ndarray, "n"]) -> str:
     return in_base64((groups + 128 * marked)[used].astype(np.uint8))
 
 
-def _act(explorer: RecordedExplorer, moment: Moment) -> dict[str, Any]:
-    act = moment.act
-    motion = act.step.motion
-    end = motion.path.positions[-1] if act.step.kind == LOOK and motion and motion.path else None
+def _step(explorer: RecordedExplorer, moment: Moment) -> dict[str, Any]:
+    record = moment.record
+    motion = record.step.motion
+    end = motion.path.positions[-1] if record.step.kind == LOOK and motion and motion.path else None
     return {
-        "time": _page_time(act.begins, moment.number - 2),
-        "title": f"{moment.number}  {title(moment.act)}",
-        "reason": act.step.reason,
+        "time": _page_time(record.begins, moment.number - 2),
+        "title": f"{moment.number}  {title(moment.record)}",
+        "reason": record.step.reason,
         "known": ", ".join(f"{value} {name}" for name, value in shares(moment.known)),
-        "look": [np.round(edge, 4).tolist() for edge in frustum(explorer, act)],
+        "look": [np.round(edge, 4).tolist() for edge in frustum(explorer, record)],
         "end": None if end is None else np.round(end, 5).tolist(),
     }

@@ -41,19 +41,19 @@ def test_it_goes_one_step_and_then_to_the_end(session: live.ExplorationSession) 
     assert session.state.phase == live.WAITING and session.state.known is None
     assert live.exploration_badge(session.state).headline == "not begun"
     session.set_mode(live.STEPPING)
-    state = until(session, lambda state: state.acts and state.phase == live.WAITING)
-    [act] = state.acts
-    assert act.trajectory is not None and state.mode == live.PAUSED
-    np.testing.assert_allclose(state.configuration, act.trajectory.positions[-1], atol=1e-9)
-    if act.step.kind == LOOK:
-        assert act.step.wanted is not None and act.step.wanted.any()
+    state = until(session, lambda state: state.steps and state.phase == live.WAITING)
+    [record] = state.steps
+    assert record.trajectory is not None and state.mode == live.PAUSED
+    np.testing.assert_allclose(state.configuration, record.trajectory.positions[-1], atol=1e-9)
+    if record.step.kind == LOOK:
+        assert record.step.wanted is not None and record.step.wanted.any()
     badge = live.exploration_badge(replace(state, phase=live.MOVING))
-    assert badge.headline.startswith("1. ") and badge.lines[0] == act.step.reason
+    assert badge.headline.startswith("1. ") and badge.lines[0] == record.step.reason
     assert badge.lines[-1].startswith("of the map ")
     session.set_mode(live.RUNNING)
     state = until(session, lambda state: state.phase == live.ENDED)
-    assert live.exploration_badge(state).kind == (VALID if state.acts[-1].step.kind == DONE else NO_MOTION)
-    assert not state.failure and not state.violation and state.acts[-1].step.motion is None
+    assert live.exploration_badge(state).kind == (VALID if state.steps[-1].step.kind == DONE else NO_MOTION)
+    assert not state.failure and not state.violation and state.steps[-1].step.motion is None
     assert {live.CHOOSING, live.MOVING} <= {one.phase for one in seen}
     assert state.known is state.explorer.views[-1]  # type: ignore[union-attr]
 
@@ -73,7 +73,7 @@ def test_a_pause_holds_the_arm_and_a_restart_begins_anew(session: live.Explorati
     assert session.state.phase == live.MOVING
     refuses(r"unknown explorer\.policy 'bold'", session.restart, policy="bold")
     session.restart(policy="probabilistic", noise=True)
-    assert session.state.configuration.tolist() == HOME.tolist() and not session.state.acts
+    assert session.state.configuration.tolist() == HOME.tolist() and not session.state.steps
     assert (session.state.settings.policy, session.state.noise) == ("probabilistic", True)
     state = until(session, lambda state: state.explorer is not None and state.phase == live.WAITING)
     assert state.explorer is not None and state.explorer.settings.policy == "probabilistic"
@@ -90,4 +90,4 @@ def test_an_error_is_shown_and_a_restart_helps(session: live.ExplorationSession,
         state = until(session, lambda state: state.phase == live.ENDED)
         assert live.exploration_badge(state).lines == ("ValueError: no camera",)
     session.restart()
-    until(session, lambda state: state.acts)
+    until(session, lambda state: state.steps)

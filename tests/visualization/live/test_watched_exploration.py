@@ -35,10 +35,10 @@ def test_people_watch_pause_go_on_and_restart(view: Any) -> None:
     page, session, drawn = view
     until(lambda: session.state.phase == live.MOVING)  # it runs since the page was opened
     session.set_mode(live.PAUSED)
-    [act] = session.state.acts
-    page.get_by_text(f"1. {act.step.kind}").first.wait_for()
+    [record] = session.state.steps
+    page.get_by_text(f"1. {record.step.kind}").first.wait_for()
     page.get_by_text("of the map").wait_for()
-    of_a_look = {"/pyramid", "/wanted"} if act.step.wanted is not None else set()
+    of_a_look = {"/pyramid", "/wanted"} if record.step.wanted is not None else set()
     until(lambda: {"/occupied", "/unknown", "/trace"} | of_a_look <= drawn.keys())
     beside = "xpath=following::input[not(@type='hidden')][1]"
     page.get_by_text("Unknown space", exact=True).locator(beside).uncheck(force=True)
@@ -55,5 +55,5 @@ def test_people_watch_pause_go_on_and_restart(view: Any) -> None:
     page.get_by_role("button", name="Restart").click()
     until(lambda: session.state.phase != live.ENDED)
     page.get_by_text("Noise", exact=True).locator(beside).check(force=True)
-    until(lambda: session.state.noise and session.state.acts)  # a step of any kind
+    until(lambda: session.state.noise and session.state.steps)  # a step of any kind
     assert session.state.mode == live.RUNNING

@@ -32,7 +32,7 @@ class RecordedView:
 
     time: float
     """Time since the first step, without pauses between motions [s]."""
-    act: int
+    step_index: int
     """Index of the step that was being executed; -1 before the first step."""
     view: DepthView
     camera: int | None
@@ -46,7 +46,7 @@ class RecordedView:
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedAct:
+class RecordedStep:
     """A step, and the state of the arm when it began."""
 
     begins: float
@@ -86,17 +86,17 @@ class RecordedExplorer(Explorer):
         """See `Explorer`."""
         super().__init__(*values, **named)
         self.views: list[RecordedView] = []
-        self.acts: list[RecordedAct] = []
+        self.steps: list[RecordedStep] = []
 
     @property
     def duration(self) -> float:
         """Duration of all motions so far [s]."""
-        return self.acts[-1].begins + self.acts[-1].duration if self.acts else 0.0
+        return self.steps[-1].begins + self.steps[-1].duration if self.steps else 0.0
 
     def observe(self, view: DepthView, stamp: float = 0.0) -> None:
         """See `Explorer.observe`."""
         super().observe(view, stamp)
-        number = len(self.acts) - 1
+        number = len(self.steps) - 1
         voxels = self.map.occupied, self.map.free
         self.views.append(RecordedView(self._time_of(view), number, view, self._camera_of(view), *voxels))
 
@@ -108,16 +108,16 @@ class RecordedExplorer(Explorer):
         T = None
         if step.kind == LOOK and self.cameras:
             T = self.cameras[0].poses(self.robot, _waypoints(step, q)[-1:])[0]
-        self.acts.append(RecordedAct(begins, step, q, self.predicted(), T))
+        self.steps.append(RecordedStep(begins, step, q, self.predicted(), T))
         return step
 
     def _time_of(self, view: DepthView) -> float:
-        trajectory = self.acts[-1].trajectory if self.acts else None
+        trajectory = self.steps[-1].trajectory if self.steps else None
         if trajectory is None or view.configuration is None:
             return self.duration
         distances = np.abs(trajectory.positions - view.configuration).max(axis=1)
         nearest = int(len(distances) - 1 - np.argmin(distances[::-1]))
-        return self.acts[-1].begins + float(trajectory.times[nearest])
+        return self.steps[-1].begins + float(trajectory.times[nearest])
 
 
 def _waypoints(step: Step, q: Configuration) -> Configurations:

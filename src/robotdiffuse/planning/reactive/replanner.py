@@ -228,11 +228,12 @@ class Replanner:
             raise InputError("problem.moving is empty; a Replanner needs moving obstacles")
         for field in ("waypoints", "constraints", "payload"):
             if getattr(problem, field):
-                raise InputError(f"problem.{field}: the replanner does not support it; rd.plan does")
+                raise InputError(f"Replanner does not support problem.{field}; use rd.plan")
         self.problem = problem
         self.settings = settings
         self.seed = seed
-        self._robot, self._still = problem.robot, replace(problem, moving=())
+        self._robot = problem.robot
+        self._still = replace(problem, moving=())
         self._validator = verifier(self._still)
         self._rng = np.random.default_rng(seed)
         self._seen = {
@@ -258,7 +259,8 @@ class Replanner:
     def _rehearse(self) -> None:
         """Make two steps on a copy, so that the compiled code is loaded before the first step is due."""
         rehearsal = copy(self)
-        rehearsal._seen, rehearsal._rng = dict(self._seen), np.random.default_rng(self.seed)
+        rehearsal._seen = dict(self._seen)
+        rehearsal._rng = np.random.default_rng(self.seed)
         rehearsal._filter = copy(self._filter)
         for k in range(2):
             rehearsal.step({}, k * self.settings.period)
@@ -281,7 +283,8 @@ class Replanner:
         )
         if isinstance(start_goal, PlanResult):
             raise InputError(f"the replanner cannot take this goal: {start_goal.reason}")
-        self.problem, self._goals = problem, np.array(start_goal.goals)
+        self.problem = problem
+        self._goals = np.array(start_goal.goals)
         self._next = None
         self._must_leave = True
 

@@ -1,8 +1,8 @@
 """A live exploration: its session, and the page that shows it in browsers.
 
 A thread of the session chooses steps and executes them at the speed of the motion. Visitors can pause, step,
-restart and change the options. The planner calls a step an act (`RecordedAct`); the kind `look`
-moves the arm to take a view.
+restart and change the options. A step of the kind `look` moves the arm to
+take a view.
 """
 
 import html
@@ -22,8 +22,8 @@ from robotdiffuse.core.types import Configuration
 from robotdiffuse.drawables import ASSUMED, GOAL, OBSERVED, drawables
 from robotdiffuse.perception.depth_view import DepthNoise
 from robotdiffuse.planning.exploration.simulated import (
-    RecordedAct,
     RecordedExplorer,
+    RecordedStep,
     RecordedView,
     explore,
     simulated_explorer,
@@ -114,7 +114,7 @@ class ExplorationState:
     explorer: RecordedExplorer | None = None
     """The explorer. Only the session's thread changes it; other threads may read its cameras and its known
     scene."""
-    acts: tuple[RecordedAct, ...] = ()
+    steps: tuple[RecordedStep, ...] = ()
     """All steps so far. In the phase MOVING, the last step is being executed."""
     known: RecordedView | None = None
     """The latest view, and what is known after it."""
@@ -221,21 +221,21 @@ class ExplorationSession:
         """Show the execution of the last step: move the arm along its motion, and show each view at the time
         at which it was taken."""
         moment = moments(explorer)[-1]
-        act = moment.act
-        self._update(run, phase=MOVING, acts=tuple(explorer.acts), known=moment.known)
+        record = moment.record
+        self._update(run, phase=MOVING, steps=tuple(explorer.steps), known=moment.known)
         at = -READING_TIME
         last = time.perf_counter()
-        while act.trajectory is not None and at < act.duration:
+        while record.trajectory is not None and at < record.duration:
             if self._wait_while_paused(run):
                 last = time.perf_counter()
             time.sleep(1 / FRAME_RATE)
             now = time.perf_counter()
             speed = self.state.speed if at >= 0 else max(self.state.speed, 1.0)
-            at = min(at + speed * (now - last), act.duration)
+            at = min(at + speed * (now - last), record.duration)
             last = now
             if at > 0:
-                taken_views = [view for view in moment.views if view.time <= act.begins + at]
-                q = act.trajectory.at(at).positions
+                taken_views = [view for view in moment.views if view.time <= record.begins + at]
+                q = record.trajectory.at(at).positions
                 self._update(run, configuration=q, known=taken_views[-1])
 
     def _update(self, run: int, **changes: Any) -> ExplorationState:
@@ -328,13 +328,13 @@ class ExplorationPage(LivePage):
     def _draw(self) -> None:
         state = self.session.state
         explorer = state.explorer
-        act = state.acts[-1] if state.acts else None
-        under_way = act if state.phase == MOVING else None
+        record = state.steps[-1] if state.steps else None
+        under_way = record if state.phase == MOVING else None
         with self.server.atomic():
             self._show_panel(state)
             if self._changes.new("configuration", state.configuration):
                 self._arm.show(state.configuration)
-            arrived = act is not None and act.step.kind == DONE
+            arrived = record is not None and record.step.kind == DONE
             if self._goal is not None and self._changes.new("arrived", arrived):
                 self._ghost.show(None if arrived else self._goal)
             if explorer is None:
@@ -345,10 +345,10 @@ class ExplorationPage(LivePage):
             if self._changes.new("scene", explorer, self._true.value):
                 scene = self.session.problem.scene if self._true.value else explorer.scene
                 self._obstacles.show(drawables(scene))
-            if self._changes.new("known", state.known, act, under_way, self._unknown.value):
-                self._show_voxels(state.known, act, under_way)
-            if self._changes.new("act", explorer, under_way):
-                self._show_act(explorer, under_way)
+            if self._changes.new("known", state.known, record, under_way, self._unknown.value):
+                self._show_voxels(state.known, record, under_way)
+            if self._changes.new("step", explorer, under_way):
+                self._show_step(explorer, under_way)
 
     def _show_camera(self, explorer: RecordedExplorer) -> None:
         """Draw the arm's first camera as a pyramid that moves with the arm."""
@@ -368,13 +368,13 @@ class ExplorationPage(LivePage):
         )
 
     def _show_voxels(
-        self, known: RecordedView | None, act: RecordedAct | None, under_way: RecordedAct | None
+        self, known: RecordedView | None, record: RecordedStep | None, under_way: RecordedStep | None
     ) -> None:
-        """Show what is known, the prediction of the step `act`, and the voxels that the step being executed,
-        `under_way`, shall observe."""
+        """Show what is known, the prediction of the step `record`, and the voxels that the step being
+        executed, `under_way`, shall observe."""
         if known is None:
             return
-        occupied, predicted, unknown = shown_voxels(known, act, self._known_scene)
+        occupied, predicted, unknown = shown_voxels(known, record, self._known_scene)
         to_view = None if under_way is None else under_way.step.wanted
         to_view = np.zeros_like(known.free) if to_view is None else to_view & known.unknown
         nothing = np.zeros_like(known.free), known.free
@@ -392,11 +392,11 @@ class ExplorationPage(LivePage):
             else:
                 add_surface(self.server, f"/{name}", surface, color, opacity)
 
-    def _show_act(self, explorer: RecordedExplorer, act: RecordedAct | None) -> None:
+    def _show_step(self, explorer: RecordedExplorer, record: RecordedStep | None) -> None:
         """Show the trace of a step's motion and, for the kind `look`, the arm at its end and the view pyramid
         there."""
-        draw_trace(self.server, self._drawn, None if act is None else act.trajectory)
-        look = act if act is not None and act.step.kind == LOOK else None
+        draw_trace(self.server, self._drawn, None if record is None else record.trajectory)
+        look = record if record is not None and record.step.kind == LOOK else None
         self._look.show(None if look is None else look.waypoints[-1])
         edges = [] if look is None else frustum(explorer, look)
         width = 0.5 * TRACE_WIDTH * reach(explorer.robot)
@@ -409,9 +409,9 @@ class ExplorationPage(LivePage):
             set_value(self._policy, state.settings.policy)
             set_value(self._noise, state.noise)
             set_value(self._speed, float(np.clip(state.speed, *SPEEDS)))
-        if self._changes.new("badge", state.phase, state.mode, state.known, state.acts, state.failure):
+        if self._changes.new("badge", state.phase, state.mode, state.known, state.steps, state.failure):
             self._badge.content = badge_html(exploration_badge(state))
-            self._steps.content = _steps_html(state.acts)
+            self._steps.content = _steps_html(state.steps)
             self._run.label = "Run" if paused else "Pause"
             self._run.icon = viser.Icon.PLAYER_PLAY if paused else viser.Icon.PLAYER_PAUSE
             self._run.disabled = self._step.disabled = state.phase == ENDED
@@ -422,23 +422,23 @@ def exploration_badge(state: ExplorationState) -> Validity:
     confidence."""
     if state.failure:
         return Validity(INVALID, "failed", (state.failure,))
-    if not state.acts or state.phase == CHOOSING:
+    if not state.steps or state.phase == CHOOSING:
         first = "a new machine compiles first, for about a minute"
-        lines = () if state.acts else (first,)
-        doing = f"choosing step {len(state.acts) + 1}" if state.phase == CHOOSING else "not begun"
+        lines = () if state.steps else (first,)
+        doing = f"choosing step {len(state.steps) + 1}" if state.phase == CHOOSING else "not begun"
         return Validity(PENDING, doing, (*lines, *_shares(state)))
-    act = state.acts[-1]
-    headline = f"{len(state.acts)}. {title(act)}"
+    record = state.steps[-1]
+    headline = f"{len(state.steps)}. {title(record)}"
     if state.phase == ENDED and state.violation:
         return Validity(INVALID, f"collides in the true scene: {state.violation}", (headline,))
     kind = PENDING
     if state.phase == ENDED:
-        kind = VALID if act.step.kind == DONE else NO_MOTION
-    lines = [act.step.reason]
-    if act.step.policy and act.step.motion is not None:
-        lines.append(f"{act.step.policy}: {PROMISES[act.step.policy]}")
-    if act.step.confidence is not None:
-        confidence = np.floor(1000 * act.step.confidence) / 10  # never rounded up to 100 %
+        kind = VALID if record.step.kind == DONE else NO_MOTION
+    lines = [record.step.reason]
+    if record.step.policy and record.step.motion is not None:
+        lines.append(f"{record.step.policy}: {PROMISES[record.step.policy]}")
+    if record.step.confidence is not None:
+        confidence = np.floor(1000 * record.step.confidence) / 10  # never rounded up to 100 %
         lines.append(f"stated confidence that it is free: {confidence:g} %")
     pause_text = ", paused" if state.mode == PAUSED and state.phase != ENDED else ""
     return Validity(kind, headline + pause_text, (*lines, *_shares(state)))
@@ -450,8 +450,8 @@ def _shares(state: ExplorationState) -> tuple[str, ...]:
     return ("of the map " + ", ".join(f"{value} {name}" for name, value in shares(state.known)),)
 
 
-def _steps_html(acts: tuple[RecordedAct, ...]) -> str:
-    rows = "".join(f"<div>{i}. {html.escape(title(act))}</div>" for i, act in enumerate(acts, 1))
+def _steps_html(steps: tuple[RecordedStep, ...]) -> str:
+    rows = "".join(f"<div>{i}. {html.escape(title(record))}</div>" for i, record in enumerate(steps, 1))
     return f'<div style="margin: 0.4em 1em; font-size: 0.85em">{rows}</div>'
 
 

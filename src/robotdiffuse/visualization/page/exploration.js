@@ -78,9 +78,9 @@ layers.forEach((layer, l) => {
 });
 
 const LOOK = color(recording.look_color);
-const looks = recording.acts.map((act) => {
+const looks = recording.steps.map((step) => {
   const group = new THREE.Group();
-  for (const edge of act.look) group.add(trace(edge, 0.004, () => LOOK));
+  for (const edge of step.look) group.add(trace(edge, 0.004, () => LOOK));
   group.visible = false;
   scene.add(group);
   return group;
@@ -101,12 +101,12 @@ scene.add(trueScene);
 const steps = document.createElement("ol");
 steps.id = "steps";
 steps.className = "panel";
-const rows = recording.acts.map((act, i) => {
+const rows = recording.steps.map((step, i) => {
   const row = document.createElement("li"), title = document.createElement("b"), details = document.createElement("span");
-  title.textContent = act.title;
-  details.textContent = `${act.reason} (${act.known})`;
+  title.textContent = step.title;
+  details.textContent = `${step.reason} (${step.known})`;
   row.append(title, details);
-  row.onclick = () => scrub(act.time / (duration || 1));
+  row.onclick = () => scrub(step.time / (duration || 1));
   steps.append(row);
   return row;
 });
@@ -135,7 +135,7 @@ addToggle("True scene", [trueScene]);
 const latest = (list, at) => Math.max(0, list.findLastIndex((entry) => entry.time <= at + 1e-6));
 let shownKnown = -1;
 function follow(at) {
-  const k = latest(recording.known, at), a = latest(recording.acts, at);
+  const k = latest(recording.known, at), a = latest(recording.steps, at);
   if (k !== shownKnown) {
     layers.forEach((layer) => {
       layer.meshes[0].geometry.dispose();
@@ -146,8 +146,8 @@ function follow(at) {
   }
   const on = lookToggle.getAttribute("aria-pressed") === "true";
   looks.forEach((look, i) => { look.visible = on && i === a; });
-  lookArm.group.visible = on && recording.acts[a].end !== null;
-  if (recording.acts[a].end !== null) lookArm.pose(frames(recording.acts[a].end));
+  lookArm.group.visible = on && recording.steps[a].end !== null;
+  if (recording.steps[a].end !== null) lookArm.pose(frames(recording.steps[a].end));
   rows.forEach((row, i) => row.setAttribute("aria-current", i === a));
   dirty = true;
 }
