@@ -8,7 +8,7 @@ import numpy as np
 import robotdiffuse as rd
 from robotdiffuse.visualization.picture import PictureSettings, write_picture
 
-post = rd.Cylinder([0.42, 0.25, 0.4], 0.06, 0.6, name="post")  # where it stands at time 0
+post = rd.Cylinder([0.42, 0.25, 0.35], 0.06, 0.6, name="post")  # where it stands at time 0
 table = rd.Box([0.55, 0.0, 0.0], [0.7, 1.6, 0.1], name="table")
 problem = rd.Problem(
     robot=rd.load_robot("panda"),

@@ -73,7 +73,10 @@ def test_plan_with_a_planner_and_settings_by_name() -> None:
     nested = rd.load_planner("diffusion", {"guidance": {"margin": 0.03}, "guidance.self_margin": 0.02})
     assert (nested.settings.guidance.margin, nested.settings.guidance.self_margin) == (0.03, 0.02)  # type: ignore[attr-defined]
     for wrong, message in (
-        ({"planner": "aorrtc", "settings": {"rang": 1}}, "aorrtc has no setting 'rang'; it has range=0.7"),
+        (
+            {"planner": "aorrtc", "settings": {"rang": 1}},
+            "aorrtc has no setting 'rang'; it has range=0.7.*; did you mean range",
+        ),
         ({"planner": "aorrtc", "settings": {"range": -1.0}}, "aorrtc.range is -1.0"),
         ({"planner": "aorrtc", "settings": "range=1"}, "settings is 'range=1'; it must be a table"),
     ):

@@ -109,6 +109,6 @@ def test_bad_input() -> None:
         ("panda_link0", np.eye(4), 1, "no planned joint moves the link 'panda_link0'"),
         ("panda_hand", np.eye(4), 0, "count is 0"),
         ("panda_hand", np.full((4, 4), np.nan), 1, "finite"),
-        ("panda_hand", 2 * np.eye(4), 1, "must be a rotation and a translation"),
+        ("panda_hand", 2 * np.eye(4), 1, "must be a homogeneous transform"),
     ):
         refuses(message, inverse_kinematics, example_robot("panda"), frame, T, count, rng=np.random.default_rng(0))

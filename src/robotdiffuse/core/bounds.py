@@ -211,7 +211,7 @@ def rigid_transform(what: str, value: object, slack: float = RIGID_SLACK) -> nda
     off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(T[3] - LAST_ROW).max())
     if off > slack or np.linalg.det(rotation) < 0:
         raise InputError(
-            f"{what} is {shown(T)}; it must be a homogeneous transform with the last row 0 0 0 1"
+            f"{what} is {shown(T)}; it must be a homogeneous transform: a rotation matrix, last row 0 0 0 1"
         )
     T[3] = LAST_ROW
     return T

@@ -22,7 +22,7 @@ from numbers import Integral, Real
 from types import UnionType
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
+from robotdiffuse.core.errors import InputError, shortened, shown, suggestion, unknown_name
 from robotdiffuse.core.input_files import parse_yaml
 from robotdiffuse.core.registry import Registry
 
@@ -274,7 +274,8 @@ class Settings:
             elif nested or name not in hints:
                 root, _, path = f"{where}.{name}".partition(".")
                 owner = root or type(self).__name__
-                raise InputError(f"{owner} has no setting {shown(path)}; it has {', '.join(known)}")
+                hint = suggestion(name, hints)
+                raise InputError(f"{owner} has no setting {shown(path)}; it has {', '.join(known)}{hint}")
             else:
                 replaced[name] = converted(f"{where}.{name}".removeprefix("."), hints[name], value)
         for name, changes in within.items():

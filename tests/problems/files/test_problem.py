@@ -82,7 +82,7 @@ def test_wrong_problems() -> None:
         (lambda: problem(None), "start is None"),
         (lambda: problem(goal=rd.PoseGoal("claw", np.eye(4))), "unknown link in goal.frame: 'claw'"),
         (lambda: problem(goal=rd.PoseGoal("plinth", np.eye(4))), "no planned joint moves 'plinth'"),
-        (lambda: rd.PoseGoal("hook", MIRROR), "it must be a rotation and a translation"),
+        (lambda: rd.PoseGoal("hook", MIRROR), "it must be a homogeneous transform"),
         (lambda: rd.Problem(crane(), [], [0], [0]), "scene is .*; it must be a Scene"),  # type: ignore[arg-type]
     ):
         refuses(message, make)

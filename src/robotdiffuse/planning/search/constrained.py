@@ -95,9 +95,11 @@ def _extended(space, limits, trees, tree, near, q, longest, scratch):
         if gap <= longest:
             end[:] = q
         else:
+            # steer towards q by at most one step, then project onto the constraints (CBiRRT)
             end[:] = origin + longest / gap * (q - origin)
             if not project(limits.rows, limits.row_limits, end, limits.work):
                 return -1
+            # the projection may have undone most of the step
             if distance(end, q) > max(MIN_APPROACH * gap, gap - 0.5 * longest):
                 return -1
         if trees.sizes[tree] + MAX_PIECES > trees.nodes.shape[1]:
@@ -151,6 +153,7 @@ def between(space, limits, a, b, most, scratch):
         if length + gap > most:
             return 0
         if _straight(limits, current, target):
+            # the straight piece to the target keeps the constraints: take it
             if count == MAX_PIECES or not motion_free(space, current, target, scratch):
                 return 0
             limits.out[count] = target
@@ -161,10 +164,12 @@ def between(space, limits, a, b, most, scratch):
             continue
         if top == MAX_DEPTH or gap < MIN_PIECE:
             return 0
+        # else split it in the middle, which is projected onto the constraints
         middle = stack[top]
         middle[:] = 0.5 * (current + target)
         if not project(limits.rows, limits.row_limits, middle, limits.work):
             return 0
+        # a middle that is far from both ends is on another branch of the solutions
         if max(distance(current, middle), distance(middle, target)) > MAX_DRIFT * gap:
             return 0
         top += 1
