@@ -43,6 +43,9 @@ class Certificate(MotionProof):
 
         Returns:
             What was checked, and each requirement that is not proved.
+
+        Raises:
+            InputError: If there is no problem, and for shapes that certificates do not support.
         """
         return check(self, problem, at_most or Tolerances())
 
@@ -147,7 +150,6 @@ def _proof(_: str, record: list[dict[str, Any]] | None) -> StretchProof | None:
 
 
 def _claim_proof(k: int, entry: dict[str, Any]) -> StretchProof:
-    """The proof of claim number k."""
     claim = Claim(str(entry["link"]), str(entry["against"]))
     start, stop, clearance, displacement = (_vector(name, entry[name]) for name in STRETCH_FIELDS)
     count = len(start)

@@ -411,7 +411,6 @@ def _cut(
 
 
 def _sorted(proof: StretchProof) -> StretchProof:
-    """The proof, sorted by claim and place."""
     order = np.lexsort((proof.stretches.start, proof.stretches.claim))
     place = np.argsort(order)
     planes = sorted(plane._replace(stretch=int(place[plane.stretch])) for plane in proof.planes)

@@ -396,7 +396,6 @@ def _settings_class(
 
 
 def _number(text: str) -> float | str:
-    """The text as a number if it is one, else unchanged."""
     try:
         return float(text)
     except ValueError:

@@ -204,7 +204,6 @@ def _positions(robot: Robot, i: int, path: object) -> ndarray:
 
 
 def _shared_floor(scenes: Sequence[Scene]) -> Box | None:
-    """The floor that all scenes begin with; None if there is none."""
     firsts = [scene.shapes[0] if scene.shapes else None for scene in scenes]
     floor = firsts[0]
     if not isinstance(floor, Box) or floor.name != "floor" or floor.wxyz[0] != 1:

@@ -333,7 +333,6 @@ class TransformHistory:
         return T
 
     def _pose_in_parent(self, frame: str, stamp: float, where: str) -> Pose:
-        """The pose of a frame relative to its parent frame at a time."""
         poses = self._poses[frame]
         if frame in self._static:
             return poses[-1][1]

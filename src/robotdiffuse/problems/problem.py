@@ -557,7 +557,6 @@ def check_unknown(field: str, value: object) -> str:
 
 
 def _check_combinations(checked: dict[str, Any]) -> None:
-    """Raises InputError for fields that cannot be combined."""
     given_fields = {
         name
         for name, value in checked.items()

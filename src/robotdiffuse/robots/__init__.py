@@ -108,7 +108,6 @@ def known_robots() -> dict[str, Path]:
 
 
 def _added() -> dict[str, Path]:
-    """Folders of added robots by name."""
     return {file.parent.name: file.parent for file in sorted(user_robots().glob(f"*/{ROBOT_FILE}"))}
 
 

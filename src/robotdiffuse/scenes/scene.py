@@ -128,6 +128,9 @@ class Scene(Value):
 
         Returns:
             A scene with these shapes, and with the allowed contacts of those whose names this scene has.
+
+        Raises:
+            InputError: For values that are not shapes.
         """
         scene = Scene(shapes)
         if self.allowed_contacts:
@@ -247,7 +250,6 @@ def _contacts(
 
 
 def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
-    """The obstacles of a model; see `Scene.from_mujoco`."""
     from robotdiffuse.robots.parsing import mjcf
 
     mujoco = mjcf.imported_mujoco()

@@ -276,11 +276,13 @@ class Explorer:
 
         Returns:
             The earliest stop on the same path; None if nothing is in the way.
+
+        Raises:
+            InputError: For a time outside of the motion.
         """
         return stop_before(self.robot, self.scene, self._news, self._free, motion, time)
 
     def _step(self, problem: Problem, policy: str) -> Step:
-        """The step under one policy: go, look or stuck."""
         if policy == STRICT and isinstance(problem.goal, JointGoal):
             goals = [q for q in problem.goal.positions if not reaches_outside(self.robot, q)]
             if not goals:
@@ -309,13 +311,11 @@ class Explorer:
         return look
 
     def _good(self, motion: PlanResult, policy: str) -> bool:
-        """Whether a motion keeps to the policy."""
         if not motion.solved or policy == STRICT:
             return motion.solved
         return motion.confidence is not None and motion.confidence >= self.settings.confidence
 
     def _may_go(self, motion: PlanResult, policy: str) -> bool:
-        """Whether a motion to the goal keeps to the policy, and the goal was seen if that is required."""
         return self._good(motion, policy) and not self._goal_seen.missing(motion)
 
     def _go(self, motion: PlanResult, policy: str) -> Step:
@@ -547,7 +547,6 @@ class Explorer:
         return UnknownSpace(self.robot, ends, self.map.unknown, predicted, 0.0, MAP, lost)
 
     def _planned(self, problem: Problem, limit: float, seed: int | None = None) -> PlanResult:
-        """The first motion found in the problem's scene, within a time limit [s]."""
         compile_scene_for(self.robot, problem.scene)  # compile now, outside the time limit
         return self._planner.plan(problem, limit, self._seed if seed is None else seed, FIRST)
 

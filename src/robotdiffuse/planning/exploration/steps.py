@@ -48,6 +48,9 @@ class ArmCamera(Value):
 
         Returns:
             T_base_camera of each [n, 4, 4].
+
+        Raises:
+            InputError: If the robot lacks the link.
         """
         return link_poses(robot, q, self.link) @ self.T_link_camera
 

@@ -333,7 +333,6 @@ class Replanner:
 
     @property
     def _rests(self) -> bool:
-        """Whether the arm is at rest."""
         return bool(self._motion.speeds[0] == 0) and self._filter.at_rest
 
     @property
@@ -342,7 +341,6 @@ class Replanner:
         return self._since + (0.0 if self._rests else self._motion.duration + self._filter.lag)
 
     def _at_goal(self) -> bool:
-        """Whether the arm, at rest, is at a goal."""
         path = self._path
         s = self._motion.s[0]
         if self._must_leave:

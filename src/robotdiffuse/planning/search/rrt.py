@@ -392,7 +392,6 @@ class AnytimeSearch:
         self._set_level(self._level)
 
     def _set_level(self, level: int) -> None:
-        """Use the clearance with the index `level` from now on."""
         self._level = level
         self._tried = 0
         self.space = self.start_goal.space(self.settings.resolution, self.clearance)
