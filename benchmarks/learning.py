@@ -7,12 +7,12 @@ Prints benchmarks/results/network.txt and network_inputs.txt. --cases FOLDER cac
 Problems are held out; the straight line does not solve them, and ten seconds of search do. A motion counts as
 solved if it passed the validator.
 
-- alone: 16 samples as the sampler returns them. The model's inputs about obstacles are the embedding ("code")
-  of their point cloud and the clearances of the links along the noisy motion. Rows of the table change one
-  input: the code is that of another scene of the family; the whole condition (code, start and goal) is
-  hidden; the clearances are computed without obstacles. Guidance knows the obstacles in every row. The
-  controls apply guidance to smooth noise, from which the model starts too: with as many gradient steps as the
-  network, and with as many as fit in the network's CPU time.
+- alone: 16 samples as the sampler returns them. The model's inputs about obstacles are the embedding of
+  their point cloud and the clearances of the links along the noisy motion. Rows of the table change one
+  input: the embedding is that of another scene of the family; the whole condition (embedding, start and
+  goal) is hidden; the clearances are computed without obstacles. Guidance knows the obstacles in every row.
+  The controls apply guidance to smooth noise, from which the model starts too: with as many gradient steps as
+  the network, and with as many as fit in the network's CPU time.
 - controls: only the guided network and the controls of `alone`; prints
   benchmarks/results/network_equal_time.txt.
 """
@@ -136,7 +136,7 @@ def network_methods(planner: Diffusion, cases: list[Case]) -> dict[str, Draw]:
     for name, sampler in (("guided", planner), ("without guidance", unguided)):
         methods |= {
             name: from_network(sampler),
-            f"{name}, code of another scene": from_network(sampler, other),
+            f"{name}, embedding of another scene": from_network(sampler, other),
             f"{name}, clearances hidden": from_network(sampler, clearances=blind),
             f"{name}, both": from_network(sampler, other, blind),
         }
@@ -187,12 +187,14 @@ def print_worth_of_inputs(records: dict[str, list[Record]]) -> None:
     rows = []
     for name in ("guided", "without guidance"):
         unchanged = np.array([record.passed or 0.0 for record in records[name]])
-        for change in ("code of another scene", "condition hidden", "clearances hidden"):
+        for change in ("embedding of another scene", "condition hidden", "clearances hidden"):
             losses = unchanged - [record.passed or 0.0 for record in records[f"{name}, {change}"]]
             low, high = (100 * x for x in bootstrap_interval(losses))
             rows.append((name, change, f"{100 * losses.mean():+.1f} ({low:+.1f} to {high:+.1f})"))
     print_table(
-        f"{len(unchanged)} problems: single samples, points", ["network", "less", "mean (95 %)"], rows
+        f"{len(unchanged)} problems: single samples, percentage points",
+        ["network", "less", "mean (95 %)"],
+        rows,
     )
 
 

@@ -49,7 +49,7 @@ def speed(calls: int) -> None:
         rows.append((f"denoiser of {name}, batch of {BATCH}", *pair))
         if exported.settings.encoder is not None:
             cloud = rng.uniform(-0.6, 0.6, (320, 3)).astype(np.float32)
-            pair = [partial(model.code_of, cloud) for model in (exported, network)]
+            pair = [partial(model.embedding_of, cloud) for model in (exported, network)]
             rows.append(("encoder, 320 points", *pair))
     seen = rng.integers(0, sum(BITS) + 1, SHAPE).astype(np.uint8)
     behind = rng.integers(0, 100, SHAPE).astype(np.uint8)

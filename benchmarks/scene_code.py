@@ -1,21 +1,22 @@
-"""Whether an embedding ("code") of the whole scene helps the diffusion model: true obstacles or point clouds.
+"""Whether an embedding of the whole scene helps the diffusion model: true obstacles or point clouds.
 
     python benchmarks/scene_code.py [--parts data,train,report] [--rows oracle,tokens] [--out FOLDER]
         [--samples 1600000] [--plot scene_code.png]
 
 Prints benchmarks/results/scene_code.txt and draws scene_code.png. After an interruption the same command
 continues; parts and rows can run at the same time. Problems and motions are of the family rop. The networks
-have no clearances as inputs and are sampled without guidance, so they know the scene only by its code. Rows:
+have no clearances as inputs and are sampled without guidance, so they know the scene only by its embedding.
+Rows:
 
-- oracle: the code of the true obstacles (kind, center, size and turn of each), by a perceptron that sums over
-  obstacles and is trained together with the denoiser;
+- oracle: the embedding of the true obstacles (kind, center, size and turn of each), by a perceptron that sums
+  over obstacles and is trained together with the denoiser;
 - tokens: points of the cloud, which the waypoints attend to, in place of one vector (config `points`);
 - pointnet: PointNet, trained together with the denoiser;
 - cae: the paper's auto-encoder, trained alone first, then frozen.
 
-Each network is sampled with the code of the problem's own scene, with the code of another problem's scene,
-with the mean code, and with a hidden condition, as in a tenth of its training. Start and goal stay visible in
-the noisy motion.
+Each network is sampled with the embedding of the problem's own scene, with that of another problem's scene,
+with the mean embedding, and with a hidden condition, as in a tenth of its training. Start and goal stay
+visible in the noisy motion.
 """
 
 import argparse
@@ -79,12 +80,12 @@ CURVE_SAMPLES = 4
 WAYPOINTS = 48
 ERROR_LEVELS = (200, 150, 100, 50)
 """Noise levels at which predictions are compared; level 200 is pure noise."""
-CODES = ("own", "another scene's", "mean", "hidden")
+EMBEDDINGS = ("own", "another scene's", "mean", "hidden")
 CHUNK = 256
 """Samples that go through a network together."""
 DECISIVE = 10.0
-"""A code of the scene counts as useful if the oracle's own code beats its mean code by this [percentage
-points]."""
+"""An embedding of the scene counts as useful if the oracle's own embedding beats its mean embedding by this
+[percentage points]."""
 
 
 # What the networks see of a scene
@@ -124,7 +125,7 @@ class ObstacleCode(Encoder):
         self.each = nn.Sequential(perceptron(9 + 6 * self.OCTAVES, 192, 192), nn.GELU("tanh"))
         self.all = perceptron(192, 192, settings.code)
 
-    def forward(self, cloud: Float[Tensor, "batch slots 9"]) -> Float[Tensor, "batch code"]:
+    def forward(self, cloud: Float[Tensor, "batch slots 9"]) -> Float[Tensor, "batch embedding"]:
         with fp32(cloud):
             angles = torch.cat(wave_angles(cloud[..., 2:5], self.OCTAVES), -1)
             known = torch.cat([cloud, angles.sin(), angles.cos()], -1)
@@ -142,7 +143,7 @@ class Row(NamedTuple):
 
 
 ROWS = {
-    "oracle": Row("true obstacles, one code", "pointnet", PointNetSettings()),
+    "oracle": Row("true obstacles, one embedding", "pointnet", PointNetSettings()),
     "tokens": Row(
         "32 points, attended to", "points", PointsSettings(), "cross_attention", CrossAttentionSettings()
     ),
@@ -273,7 +274,7 @@ class SceneTask(PlannerTask):
             loss = self._loss
             encoded = np.zeros((1, self.model.settings.code), np.float16)  # no clouds need to be made
             self.train_data, self.validation_data = (
-                replace(data, codes=np.broadcast_to(encoded, (len(data), encoded.shape[1])))
+                replace(data, embeddings=np.broadcast_to(encoded, (len(data), encoded.shape[1])))
                 for data in (self.train_data, self.validation_data)
             )
 
@@ -309,18 +310,18 @@ class Results(NamedTuple):
     samples: int
     """Number of training samples that the network saw."""
     passed: dict[str, Float[ndarray, "n count"]]
-    """For each kind of code, which samples for each problem pass the validator."""
+    """For each kind of embedding, which samples for each problem pass the validator."""
 
 
 def tried(
-    row: str, model: MotionNetwork, cases: Sequence[Case], codes: Sequence[str], count: int
+    row: str, model: MotionNetwork, cases: Sequence[Case], embeddings: Sequence[str], count: int
 ) -> dict[str, Float[ndarray, "n count"]]:
-    """For each kind of code, which of `count` samples for each problem pass the validator."""
+    """For each kind of embedding, which of `count` samples for each problem pass the validator."""
     scenes = PackedScenes.pack([case.problem.scene for case in cases], 2, floor=True)
     assert model.encoder is not None
-    z = codes_of(row, model.encoder, scenes)
+    z = embeddings_of(row, model.encoder, scenes)
     passed_by_code = {}
-    for name in codes:
+    for name in embeddings:
         q = sampled_motions(model, cases, z[name], count, hidden=name == "hidden")
         pairs = zip(cases, q, strict=True)
         passed_by_code[name] = np.array(
@@ -334,17 +335,19 @@ def no_clearances(q: ndarray) -> ndarray:
     return np.zeros(0, np.float32)
 
 
-def codes_of(row: str, encoder: Encoder, scenes: PackedScenes) -> dict[str, Float32[ndarray, "n code"]]:
-    """The code of each scene, for each kind of CODES; for "hidden" it is not used."""
+def embeddings_of(
+    row: str, encoder: Encoder, scenes: PackedScenes
+) -> dict[str, Float32[ndarray, "n embedding"]]:
+    """The embedding of each scene, for each kind of EMBEDDINGS; for "hidden" it is not used."""
     with torch.no_grad():
         z = encoder(seen(row, encoder, scenes, np.random.default_rng(5))).numpy().astype(np.float32)
-    return dict(zip(CODES, (z, np.roll(z, 1, 0), np.repeat(z.mean(0)[None], len(z), 0), z), strict=True))
+    return dict(zip(EMBEDDINGS, (z, np.roll(z, 1, 0), np.repeat(z.mean(0)[None], len(z), 0), z), strict=True))
 
 
 def sampled_motions(
-    model: MotionNetwork, cases: Sequence[Case], z: Float32[ndarray, "n code"], count: int, hidden: bool
+    model: MotionNetwork, cases: Sequence[Case], z: Float32[ndarray, "n embedding"], count: int, hidden: bool
 ) -> Float[ndarray, "n count waypoints dof"]:
-    """Samples for each problem with its code, or with the condition hidden."""
+    """Samples for each problem with its embedding, or with the condition hidden."""
     rng = np.random.default_rng(11)
     motions = []
     each = max(CHUNK // count, 1)
@@ -352,9 +355,9 @@ def sampled_motions(
         np.array([end(case.problem) for case in cases]) for end in (lambda problem: problem.start, goal_of)
     )
     for i in range(0, len(cases), each):
-        start, goal, code = (np.repeat(part[i : i + each], count, 0) for part in (starts, goals, z))
+        start, goal, embedding = (np.repeat(part[i : i + each], count, 0) for part in (starts, goals, z))
         reference = model.reference(start, goal)
-        condition = model.condition(code, start, goal)
+        condition = model.condition(embedding, start, goal)
         predict = model.predictor(reference, condition, no_clearances, 0.0 if hidden else 1.0)
         x = ddim(predict, model.schedule, partial(model.draw_noise, len(start), rng), SAMPLING_STEPS)
         q = np.clip(model.joints(x, reference), PANDA.lower, PANDA.upper)
@@ -362,12 +365,12 @@ def sampled_motions(
     return np.concatenate(motions)
 
 
-def results(row: str, study: Study, cases: Sequence[Case], codes: Sequence[str]) -> Results:
-    """The results of the newest checkpoint with each code. They are cached in the folder of the row."""
+def results(row: str, study: Study, cases: Sequence[Case], embeddings: Sequence[str]) -> Results:
+    """The results of the newest checkpoint with each embedding. They are cached in the folder of the row."""
     model, samples = study.trained(row)
     passed_by_code = {}
-    for name in codes:
-        file = study.folder(row) / "tried" / f"{samples}_{len(cases)}_{CODES.index(name)}.npy"
+    for name in embeddings:
+        file = study.folder(row) / "tried" / f"{samples}_{len(cases)}_{EMBEDDINGS.index(name)}.npy"
         if not file.exists():
             file.parent.mkdir(exist_ok=True)
             np.save(file, tried(row, model, cases, [name], BEST_OF)[name])
@@ -376,11 +379,12 @@ def results(row: str, study: Study, cases: Sequence[Case], codes: Sequence[str])
 
 
 def errors(row: str, study: Study) -> list[tuple[str, ...]]:
-    """Rows of the table of errors: the squared error of predicted motions, for each noise level and code."""
+    """Rows of the table of errors: the squared error of predicted motions, for each noise level and
+    embedding."""
     model, _ = study.trained(row)
     q, scenes = validation_motions(study.data)
     assert model.encoder is not None
-    z = codes_of(row, model.encoder, scenes)
+    z = embeddings_of(row, model.encoder, scenes)
     reference = model.reference(q[:, 0], q[:, -1])
     clean = model.normalize(q, reference)
     rows = []
@@ -389,8 +393,8 @@ def errors(row: str, study: Study) -> list[tuple[str, ...]]:
         signal, deviation = (float(levels[level]) for levels in (model.schedule.signal, model.schedule.noise))
         noisy = (signal * clean + deviation * noise).astype(np.float32)
         squared_errors = []
-        for name, code in z.items():
-            condition = model.condition(code, q[:, 0], q[:, -1])
+        for name, embedding in z.items():
+            condition = model.condition(embedding, q[:, 0], q[:, -1])
             predict = model.predictor(reference, condition, no_clearances, 0.0 if name == "hidden" else 1.0)
             squared_errors.append(f"{np.square(predict(noisy, level) - clean)[:, 1:-1].mean():.3f}")
         rows.append((f"{ROWS[row].title}: level {level}", *squared_errors))
@@ -432,14 +436,14 @@ def report(study: Study, rows: Sequence[str], plot: Path) -> None:
     worth = []
     conclusion = ""
     for row in progress(rows, "networks"):
-        samples, passed_by_code = results(row, study, cases, CODES)
+        samples, passed_by_code = results(row, study, cases, EMBEDDINGS)
         for name, passed in passed_by_code.items():
             single = passed.mean(1)
             best = passed.max(1)
             table.append((f"{ROWS[row].title}: {name}", f"{samples:,}", in_points(single), in_points(best)))
         own_code = passed_by_code["own"]
         mean_code = passed_by_code["mean"]
-        for name in CODES[1:]:
+        for name in EMBEDDINGS[1:]:
             less = (
                 own_code.mean(1) - passed_by_code[name].mean(1),
                 own_code.max(1) - passed_by_code[name].max(1),
@@ -450,31 +454,32 @@ def report(study: Study, rows: Sequence[str], plot: Path) -> None:
             verdict = "can matter" if points >= DECISIVE else "is the bottleneck so far, not its encoder"
             over = in_points(own_code.mean(1) - mean_code.mean(1), "+")
             conclusion = (
-                f"After {samples:,} training samples the oracle's own code is worth {over} points of single "
-                f"samples over the mean code of the same network: a code of the whole scene {verdict}."
+                f"After {samples:,} training samples the oracle's own embedding is worth {over} percentage "
+                f"points of single samples over the mean embedding of the same network: an embedding of the "
+                f"whole scene {verdict}."
             )
     noise = without_network(cases)
     table.append(("no network: smooth noise", "", in_points(noise.mean(1)), in_points(noise.max(1))))
     print_table(
         f"{len(cases)} held-out problems of {FAMILY}, {BEST_OF} samples each, no guidance: passed, %",
-        ["network: code", "training samples", "single (95 %)", f"best of {BEST_OF} (95 %)"],
+        ["network: embedding", "training samples", "single (95 %)", f"best of {BEST_OF} (95 %)"],
         table,
     )
     print_table(
-        "The own code over others in the same network, paired, points",
+        "The own embedding over others in the same network, paired, percentage points",
         ["network", "single (95 %)", f"best of {BEST_OF} (95 %)"],
         worth,
         (conclusion,) if conclusion else (),
     )
     print_table(
         "Error of predicted motions of unseen scenes: squared, in units of the motions' variance",
-        ["network: noise level", *CODES],
+        ["network: noise level", *EMBEDDINGS],
         [line for row in rows for line in errors(row, study)],
     )
     curves = {row: curve(study, row) for row in rows}
     print_table(
         f"Learning curves: single samples that pass, %, on {min(CURVE_PROBLEMS, len(cases))} of the problems",
-        ["network", "training samples", "own code", "hidden"],
+        ["network", "training samples", "own embedding", "hidden"],
         [
             (ROWS[row].title, f"{at['samples']:,}", f"{100 * at['own']:.1f}", f"{100 * at['hidden']:.1f}")
             for row, points in curves.items()

@@ -282,7 +282,7 @@ def test_batches_with_clouds_instead_of_codes(data):
     settings = MotionModelSettings(encoder="dgcnn", encoder_settings=encoder.settings)
     model = MotionNetwork(RobotIdentity.of(arm), settings)
     kept = load_data(str(data), arm, None, settings.waypoints, lambda text: None)
-    assert kept.codes is None
+    assert kept.embeddings is None
     batches = Batches(kept, model, lambda scenes, q: np.ones((*q.shape[:2], 3)), 0.1, 5.0)
     first, again = (batches.draw(8, np.random.default_rng(3)) for _ in range(2))
     assert first.clouds is not None and again.clouds is not None

@@ -230,8 +230,8 @@ def from_network(
         rng = run.rng()
         model = sampler.network(problem.robot)
         scene_checker = checker if encoded is None else CollisionChecker(problem.robot, encoded(run).scene)
-        code = encode(model, scene_checker, sampler.settings.points, rng)
-        return sampler.draw(model, checker, code, problem.start, goal_of(problem)[None], rng, clearances)
+        embedding = encode(model, scene_checker, sampler.settings.points, rng)
+        return sampler.draw(model, checker, embedding, problem.start, goal_of(problem)[None], rng, clearances)
 
     return draw
 

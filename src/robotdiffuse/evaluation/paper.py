@@ -496,12 +496,12 @@ def denoising(problem: Problem) -> list[Noisy]:
     robot = problem.robot
     model = planner.network(robot)
     checker = CollisionChecker(robot, problem.scene)
-    code = encode(model, checker, planner.settings.points, rng)
+    embedding = encode(model, checker, planner.settings.points, rng)
     start = problem.start
     goal = goal_of(problem)
     reference = model.reference(start[None], goal[None])
     predict = model.predictor(
-        reference, model.condition(code, start, goal), link_clearances(checker, model.settings)
+        reference, model.condition(embedding, start, goal), link_clearances(checker, model.settings)
     )
     states: list[tuple[float, ndarray]] = []
 

@@ -9,9 +9,9 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.motion_model import (
     Cloud,
-    Code,
     Conditions,
     Dropped,
+    Embedding,
     Features,
     Levels,
     MotionModel,
@@ -112,7 +112,7 @@ class ExportedModel(MotionModel):
             inputs["dropped"] = np.zeros(len(features), np.bool_) if dropped is None else dropped
         return self._denoiser(**inputs)
 
-    def code_of(self, cloud: Cloud) -> Code:
+    def embedding_of(self, cloud: Cloud) -> Embedding:
         """See `MotionModel`."""
         assert self._encoder is not None
         return self._encoder(cloud=cloud[None])[0]

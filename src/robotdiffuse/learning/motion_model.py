@@ -43,7 +43,7 @@ Conditions = Float32[ndarray, "batch condition"]
 Outputs = Float32[ndarray, "batch waypoints dof"]
 Dropped = Bool[ndarray, "batch"]
 Cloud = Float32[ndarray, "points 3"]
-Code = Float32[ndarray, "code"]
+Embedding = Float32[ndarray, "code"]
 TARGETS = ("residual", "absolute", "limits")
 
 
@@ -297,10 +297,10 @@ class MotionModel(ABC):
         """
 
     @abstractmethod
-    def code_of(self, cloud: Cloud) -> Code:
+    def embedding_of(self, cloud: Cloud) -> Embedding:
         """z of a cloud from `EncoderSettings.prepared`. The model must have an encoder."""
 
-    def encode(self, points: Points, rng: Generator | None = None) -> Code:
+    def encode(self, points: Points, rng: Generator | None = None) -> Embedding:
         """z of a point cloud of the obstacles' surfaces (base frame, [m]); an empty cloud is allowed.
 
         Without an encoder, z is empty.
@@ -314,7 +314,7 @@ class MotionModel(ABC):
         if len(points) > max_points:
             rng = rng or np.random.default_rng(0)
             points = points[rng.choice(len(points), max_points, replace=False)]
-        return self.code_of(encoder_settings.prepared(points))
+        return self.embedding_of(encoder_settings.prepared(points))
 
     def features(
         self, x: Float[ndarray, "batch waypoints dof"], reference: Reference, clearances: ClearanceFn
@@ -335,7 +335,7 @@ class MotionModel(ABC):
 
     def condition(
         self,
-        code: Float[ndarray, "*batch code"],
+        embedding: Float[ndarray, "*batch code"],
         start: Joints,
         goal: Joints,
     ) -> Float[ndarray, "*batch condition"]:
@@ -344,7 +344,7 @@ class MotionModel(ABC):
         if self.settings.encoder is None:
             return np.zeros((*np.shape(start)[:-1], 1), np.float32)
         ends = [self._unit(q) for q in (start, goal)]
-        return np.concatenate([code, *ends], axis=-1, dtype=np.float32)
+        return np.concatenate([embedding, *ends], axis=-1, dtype=np.float32)
 
     def denoised_guided(
         self,
@@ -371,7 +371,7 @@ class MotionModel(ABC):
         self,
         start: Configuration,
         goal: Configuration,
-        code: Float[ndarray, "code"],
+        embedding: Float[ndarray, "code"],
         clearances: ClearanceFn,
         rng: Generator,
         settings: SamplingSettings | None = None,
@@ -379,7 +379,7 @@ class MotionModel(ABC):
     ) -> Float[ndarray, "samples waypoints dof"]:
         """Trajectories from start to goal [rad], float64; they begin and end exactly there.
 
-        code: z of the scene, from `encode`.
+        embedding: z of the scene, from `encode`.
         clearances: see ClearanceFn.
         settings: None: the defaults.
         guide: improves the predicted clean trajectories in the guided steps (paper, section Motion Guided
@@ -398,7 +398,9 @@ class MotionModel(ABC):
         draw = SAMPLERS.load(settings.sampler or self.settings.sampler)
         steps = settings.sampling_steps or self.settings.sampling_steps or self.schedule.steps
         reference = self.reference(start[None], goal[None])
-        predict_unguided = self.predictor(reference, self.condition(code, start, goal), clearances, scale)
+        predict_unguided = self.predictor(
+            reference, self.condition(embedding, start, goal), clearances, scale
+        )
         unguided = steps - ceil(settings.guided_share * steps - 1e-9)
         guided: Int[ndarray, "n"] = self.schedule.sampling_levels(steps)[unguided:-1]
 

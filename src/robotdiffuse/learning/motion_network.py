@@ -14,9 +14,9 @@ from robotdiffuse.learning.encoders import make_encoder
 from robotdiffuse.learning.encoders.networks import fp32
 from robotdiffuse.learning.motion_model import (
     Cloud,
-    Code,
     Conditions,
     Dropped,
+    Embedding,
     Features,
     Levels,
     MotionModel,
@@ -143,7 +143,7 @@ class MotionNetwork(Network, MotionModel):
             inputs = torch.from_numpy(features), torch.from_numpy(level), torch.from_numpy(condition)
             return self.denoise(*inputs, hidden).numpy()
 
-    def code_of(self, cloud: Cloud) -> Code:
+    def embedding_of(self, cloud: Cloud) -> Embedding:
         """See `MotionModel`."""
         assert self.encoder is not None
         with torch.inference_mode():

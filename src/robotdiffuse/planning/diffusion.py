@@ -57,7 +57,7 @@ class DiffusionSettings(SamplingSettings, LearnedSettings, name="diffusion"):
 
 def encode(
     model: "MotionModel", checker: CollisionChecker, points: int, rng: np.random.Generator
-) -> Float[ndarray, "code"]:
+) -> Float[ndarray, "embedding"]:
     """The embedding z of a scene: the output of the frozen encoder for `points` random points on the scene's
     surfaces. An encoder for clouds of a fixed size gets that number of points."""
     encoder_settings = model.settings.encoder_settings
@@ -85,7 +85,7 @@ class Diffusion(ExportedPlanner[DiffusionSettings]):
         self,
         model: "MotionModel",
         checker: CollisionChecker,
-        code: Float[ndarray, "code"],
+        embedding: Float[ndarray, "embedding"],
         start: Configuration,
         goals: Configurations,
         rng: np.random.Generator,
@@ -94,7 +94,7 @@ class Diffusion(ExportedPlanner[DiffusionSettings]):
     ) -> Trajectories:
         """A batch of samples under guidance, divided among the nearest goals.
 
-        code: the scene embedding from `encode`.
+        embedding: the scene embedding from `encode`.
         clearances: the function that computes the model's clearance inputs; None: from the checker's scene.
         constraints: path constraints, which add a cost to guidance.
         """
@@ -113,7 +113,7 @@ class Diffusion(ExportedPlanner[DiffusionSettings]):
             model.sample(
                 start,
                 goal,
-                code,
+                embedding,
                 clearances,
                 rng,
                 replace(settings, samples=count),
@@ -128,14 +128,16 @@ class Diffusion(ExportedPlanner[DiffusionSettings]):
         model = self.network(context.problem.robot)
         rng = context.rng
         start, goals = start_goal.rows()
-        code = encode(model, start_goal.checker, self.settings.points, rng)
+        embedding = encode(model, start_goal.checker, self.settings.points, rng)
         names = context.problem.robot.joint_names
         constraints = context.validator.constraints
         samples = list[Path]()
         valid = list[Path]()
         until = context.request.time_limit
         while not samples or (context.elapsed < until and (valid or self.settings.repeat)):
-            batch = self.draw(model, start_goal.checker, code, start, goals, rng, constraints=constraints)
+            batch = self.draw(
+                model, start_goal.checker, embedding, start, goals, rng, constraints=constraints
+            )
             if constraints is not None:
                 batch = [_projected(constraints, q) for q in batch]
             paths = [Path(names, start_goal.complete(q)) for q in batch]

@@ -22,7 +22,7 @@ def test_codes_are_cached_beside_the_data(data, arm):
     assert len(cached) == 2 and f"{len(first)} trajectories" in messages[-1]
     cached[0].write_bytes(b"damaged")
     again = load_data(str(data), arm, encoder, WAYPOINTS, messages.append)
-    np.testing.assert_array_equal(again.codes, first.codes)
+    np.testing.assert_array_equal(again.embeddings, first.embeddings)
     assert again.digest == first.digest
 
 

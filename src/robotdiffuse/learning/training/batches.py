@@ -1,4 +1,4 @@
-"""Training data: planned trajectories with the embeddings (codes) of their scenes, random scenes, and batches
+"""Training data: planned trajectories with the embeddings of their scenes, random scenes, and batches
 drawn from both."""
 
 import hashlib
@@ -68,7 +68,7 @@ class TrajectoryData:
     scenes: PackedScenes
     trivial: Mask
     """Whether the straight line from start to goal is free."""
-    codes: Float[ndarray, "n code"] | None
+    embeddings: Float[ndarray, "n embedding"] | None
     """Embedding z of each scene, float16; None if there is no frozen encoder."""
     digest: str
     """The first 16 digits of the SHA-256 of the shards."""
@@ -100,9 +100,9 @@ class TrajectoryData:
         return rows
 
     def _rows(self, rows: slice) -> "TrajectoryData":
-        codes = None if self.codes is None else self.codes[rows]
+        embeddings = None if self.embeddings is None else self.embeddings[rows]
         return replace(
-            self, q=self.q[rows], scenes=self.scenes[rows], trivial=self.trivial[rows], codes=codes
+            self, q=self.q[rows], scenes=self.scenes[rows], trivial=self.trivial[rows], embeddings=embeddings
         )
 
 
@@ -118,10 +118,10 @@ def load_data(
     report: Callable[[str], None],
     turned_copies: int = 0,
 ) -> TrajectoryData:
-    """The rows of a data set for training and validation, resampled to `waypoints`, with codes of their
+    """The rows of a data set for training and validation, resampled to `waypoints`, with embeddings of their
     scenes.
 
-    encoder: computes the codes; None: there are no codes.
+    encoder: computes the embeddings; None: there are no embeddings.
     turned_copies: number of copies of each training row, turned by random angles, see `datasets.rows.turned`;
         no copies are made if the robot's first joint does not rotate about the vertical.
     report: called with messages about the progress.
@@ -141,54 +141,54 @@ def load_data(
     for rows in read_rows(folder, robot, waypoints, turned_copies):
         fingerprints += [rows.shard.fingerprint] * (rows.turn == 0)
         key = f"{rows.shard.fingerprint}-{encoder_fingerprint}" + (f"-turn{rows.turn}" if rows.turn else "")
-        codes = _codes(FilePath(folder), rows.scenes, encoder, key)
+        embeddings = _embeddings(FilePath(folder), rows.scenes, encoder, key)
         for name, collected in parts.items():
             chosen = rows.split == SPLITS.index(name)
             collected.append(
-                (rows.q[chosen], rows.scenes[chosen], rows.shard["line_free"][chosen], codes[chosen])
+                (rows.q[chosen], rows.scenes[chosen], rows.shard["line_free"][chosen], embeddings[chosen])
             )
             count += int(chosen.sum())
         if rows.turn == turned_copies:
             report(f"data: {len(fingerprints)} of {shards} shards, {count:,} trajectories")
-    q, scenes, trivial, codes = zip(*parts["train"], *parts["validation"], strict=True)
+    q, scenes, trivial, embeddings = zip(*parts["train"], *parts["validation"], strict=True)
     return TrajectoryData(
         np.concatenate(q),
         PackedScenes.joined(scenes),
         np.concatenate(trivial),
-        None if encoder is None else np.concatenate(codes),
+        None if encoder is None else np.concatenate(embeddings),
         hashlib.sha256("".join(fingerprints).encode()).hexdigest()[:16],
         sum(len(part[0]) for part in parts["validation"]),
     )
 
 
-def _codes(
+def _embeddings(
     folder: FilePath,
     scenes: PackedScenes,
     encoder: Encoder | None,
     key: str,
-) -> Float[ndarray, "n code"]:
+) -> Float[ndarray, "n embedding"]:
     """Codes of scenes, cached in a file named by `key`; empty embeddings if there is no encoder."""
     if encoder is None:
         return np.zeros((len(scenes), 0), np.float16)
     cache = folder / "codes" / f"{key}.npy"
-    with suppress(OSError, ValueError, EOFError):  # if it is missing or damaged, the codes are computed below
-        codes = np.load(cache)
-        if len(codes) == len(scenes):
-            return codes
-    codes = encode_scenes(encoder, scenes, np.random.default_rng(int(key[:8], 16)))
-    with suppress(InputError):  # in a read-only data folder, the codes are computed again next time
-        write_atomically(cache, lambda stream: np.save(stream, codes), make_folder=True)
-    return codes
+    with suppress(OSError, ValueError, EOFError):  # missing or damaged
+        embeddings = np.load(cache)
+        if len(embeddings) == len(scenes):
+            return embeddings
+    embeddings = encode_scenes(encoder, scenes, np.random.default_rng(int(key[:8], 16)))
+    with suppress(InputError):  # in a read-only data folder, the embeddings are computed again next time
+        write_atomically(cache, lambda stream: np.save(stream, embeddings), make_folder=True)
+    return embeddings
 
 
-def encode_scenes(encoder: Encoder, scenes: PackedScenes, rng: Generator) -> Float[ndarray, "n code"]:
-    """The code z of each scene, from a random cloud; float16."""
-    codes = [np.zeros((0, encoder.settings.code), np.float16)]
+def encode_scenes(encoder: Encoder, scenes: PackedScenes, rng: Generator) -> Float[ndarray, "n embedding"]:
+    """The embedding z of each scene, from a random cloud; float16."""
+    embeddings = [np.zeros((0, encoder.settings.code), np.float16)]
     for i in range(0, len(scenes), 256):
         clouds = scene_clouds(encoder, scenes[i : i + 256], rng)
         with torch.inference_mode(), fast_autocast():
-            codes.append(encoder(clouds).numpy().astype(np.float16))
-    return np.concatenate(codes)
+            embeddings.append(encoder(clouds).numpy().astype(np.float16))
+    return np.concatenate(embeddings)
 
 
 def scene_clouds(
@@ -265,10 +265,10 @@ class Batches:
         model = self.model
         schedule = self.model.schedule
         scenes = data.scenes[rows]
-        codes = np.zeros((len(rows), model.settings.code), np.float32)
+        embeddings = np.zeros((len(rows), model.settings.code), np.float32)
         clouds = None
-        if data.codes is not None:
-            codes = data.codes[rows].astype(np.float32)
+        if data.embeddings is not None:
+            embeddings = data.embeddings[rows].astype(np.float32)
         elif model.encoder is not None:
             clouds = scene_clouds(model.encoder, scenes, rng)
         q = data.q[rows]
@@ -288,7 +288,7 @@ class Batches:
         return Batch(
             features=model.features(clamped, reference, lambda at: self.clearances(scenes, at)),
             level=(levels / schedule.steps).astype(np.float32),
-            condition=model.condition(codes, q[:, 0], q[:, -1]),
+            condition=model.condition(embeddings, q[:, 0], q[:, -1]),
             clouds=clouds,
             clean=clean,
             noisy=noisy,

@@ -506,14 +506,14 @@ class MotionTask(TrainingTask):
     def __init__(
         self, settings: MotionTraining, robot: Robot, encoder: Encoder | None, processes: Processes
     ) -> None:
-        """encoder: the frozen encoder that computes the codes of the scenes, if there is one.
+        """encoder: the frozen encoder that computes the embeddings of the scenes, if there is one.
 
         Raises InputError if the data do not fit the robot, or there are none for training.
         """
         self.settings = settings
         self.robot = robot
         self.processes = processes
-        # the first process caches the codes of the scenes for the other processes
+        # the first process caches the embeddings of the scenes for the other processes
         with processes.first_goes_first():
             self.data = load_data(
                 settings.data, robot, encoder, settings.waypoints, self._report, settings.turned_copies

@@ -152,16 +152,16 @@ def planning_success(
     for row in np.flatnonzero(~data.trivial)[:problems].tolist():
         start, *_, goal = data.q[row].astype(np.float64)
         checker = CollisionChecker(robot, data.scenes.scene(row))
-        code = np.zeros(0)
+        embedding = np.zeros(0)
         guide = None
-        if data.codes is not None:
-            code = data.codes[row]
+        if data.embeddings is not None:
+            embedding = data.embeddings[row]
         elif model.encoder is not None:
-            code = encode_scenes(model.encoder, data.scenes[row : row + 1], rng)[0]
+            embedding = encode_scenes(model.encoder, data.scenes[row : row + 1], rng)[0]
         if model.encoder is None:
             guide = partial(_guided, CollisionGuidance(checker))
         clearances = link_clearances(checker, model.settings)
-        q = model.sample(start, goal, code.astype(np.float32), clearances, rng, settings, guide)
+        q = model.sample(start, goal, embedding.astype(np.float32), clearances, rng, settings, guide)
         space = search_space(checker, CHECK_STEP)
         free.append(np.mean([motions_free(space, motion).all() for motion in q]))
     return float(np.mean(free)) if free else float("nan")
