@@ -69,6 +69,16 @@ BAD_CALL = {
     "too few waypoints": ([*TRAIN, "--waypoints", "2"], "waypoints is 2"),
     "more threads than a machine has": ([*TRAIN, "--threads", "1000000"], "threads is 1000000; it must be between"),
     "unknown device": ([*TRAIN, "--device", "tpu"], "known: cpu, cuda"),
+    "a file as data": (["data", "info", "problem.json"], "there is no problem.json/manifest.json"),
+    "a page below a file": (["view", "problem.json", "--out", "problem.json/x.html"], "problem.json is a file, not a folder"),
+    "an output that no folder takes": (["explore", "problem.json", "--record", "/proc/x.mcap"], "x.mcap cannot be written"),
+    "ending of exported data": (["data", "export", ".", "x.txt"], "unknown ending '.txt'; known: .npz"),
+    "a recording as result": (["view", "x.mcap"], "unknown result file format of x.mcap: '.mcap'; known: .json"),
+    "a recording as certificate": (["certificate", "check", "x.mcap"], "unknown certificate format of x.mcap"),
+    "a port that none has": (["serve", "--port", "65536"], "--port: '65536' is not a port, an integer from 0 to 65535"),
+    "an encoder that is none": (["train", "encoder", "--encoder", "e", "--out", "o"], "trained alone 'e'; known:"),
+    "training without data": (["train", "planner", "--data", "d", "--out", "o"], "no data set"),
+    "problems that are none": (["bench", "run", "--planners", "aorrtc", "--problems", "p", "--out", "o"], "'p' are neither"),
     "workers for existing data": ([*TRAIN, "--workers", "2"], "--workers is for data to be generated"),
 }  # fmt: skip
 
@@ -79,6 +89,7 @@ def test_bad_call_is_status_2_in_one_line(case: str, tmp_path: Path, said: Said)
     argv, named = BAD_CALL[case]
     error = said(2, *argv)
     assert "error: " in error and named in error and error.count("\n") == 1
+    assert [file.name for file in tmp_path.iterdir()] == ["problem.json"]
 
 
 def test_what_does_not_fit_into_memory_is_one_line(monkeypatch: pytest.MonkeyPatch, said: Said) -> None:
@@ -262,6 +273,8 @@ def test_robot_add_with_srdf_and_robot_list(
         assert run("robot", "add", str(file), *given) == 0
     assert frozenset(("base", "j4_link")) in load_robot("by_srdf").allowed_collisions
     assert "unknown link in allow 'moon'" in said(2, "robot", "add", str(file), "--allow", "base", "moon")
+    refused = said(2, "robot", "add", str(file), "--out", "made.srdf")
+    assert "folder made.srdf: it is a file" in refused and refused.count("\n") == 1  # before the first step
     out = said(0, "robot", "list")
     assert all(name in out for name in ("panda", "made", "by_srdf"))
     assert len(str(load_robot("panda")).splitlines()) <= 10

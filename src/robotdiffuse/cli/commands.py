@@ -10,6 +10,7 @@ from robotdiffuse.cli.arguments import (
     natural,
     not_negative,
     pair,
+    port,
     positive,
 )
 from robotdiffuse.cli.command import (
@@ -192,7 +193,7 @@ PLANNING = (
                 "another robot that requests may name: one of `robot add`, or a URDF file; repeatable",
             ),
             ("--host HOST", "address to listen on (default: 127.0.0.1)"),
-            ("--port PORT", "port; 0 for any free one (default: 8000)", natural),
+            ("--port PORT", "port; 0 for any free one (default: 8000)", port),
             ("--workers N", "processes that plan (default: one per core)", count),
             (
                 "--queue N",

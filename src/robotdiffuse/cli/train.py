@@ -98,9 +98,17 @@ def run_planner(arguments: Namespace) -> None:
     if bundled:
         options["encoder"] = str(Path(arguments.out) / "encoder")
     settings = planner_training(arguments.config, options)
+    folder = Path(arguments.out)
+    new = bundled and not (folder / "encoder").exists()
     if bundled:
-        copy_bundled_encoder(Path(arguments.out) / "encoder")
-    _print_report(train_planner(settings, arguments.out), arguments.out)
+        copy_bundled_encoder(folder / "encoder")
+    try:
+        report = train_planner(settings, arguments.out)
+    except InputError:
+        if new and os.listdir(folder) == ["encoder"]:
+            shutil.rmtree(folder)
+        raise
+    _print_report(report, arguments.out)
 
 
 def run_baseline(arguments: Namespace) -> None:

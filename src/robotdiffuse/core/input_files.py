@@ -12,7 +12,7 @@ import re
 import stat
 import xml.etree.ElementTree as ET
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -22,7 +22,7 @@ import numpy as np
 import yaml
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, check_type, reading, repeated, shortened, shown
+from robotdiffuse.core.errors import InputError, check_type, reading, repeated, shortened, shown, unknown_name
 
 MEGABYTE = 2**20
 MAX_FILE_SIZE = 256 * MEGABYTE
@@ -66,6 +66,13 @@ def file_name(file: object, what: str = "file") -> Path:
     except ValueError:  # a NUL in the name; `input_file` raises InputError for it
         pass
     return path
+
+
+def check_ending(file: str | Path, what: str, endings: Collection[str]) -> None:
+    """Raises InputError, naming `what`, unless the file name has one of the endings."""
+    ending = file_name(file, what).suffix.lower()
+    if ending not in endings:
+        raise unknown_name(f"{what} format of {file}:", ending, endings)
 
 
 def is_file(file: str | Path) -> bool:

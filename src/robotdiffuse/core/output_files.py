@@ -8,7 +8,7 @@ import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, TemporaryFile
 from typing import Any, BinaryIO
 
 from robotdiffuse.core.errors import InputError, OutputError, shown
@@ -96,9 +96,14 @@ def check_output(file: str | Path, endings: tuple[str, ...], *inputs: str | None
     if path.is_dir():
         raise InputError(f"{path} is a folder; name a file")
     if not path.parent.is_dir():
-        raise InputError(f"{path}: the folder {path.parent} does not exist")
-    if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
-        raise InputError(f"{path} cannot be written: permission denied")
+        why = "is a file, not a folder" if path.parent.exists() else "does not exist"
+        raise InputError(f"{path}: the folder {path.parent} {why}")
+    try:
+        TemporaryFile(dir=path.parent).close()
+        if path.exists() and not os.access(path, os.W_OK):
+            raise PermissionError("permission denied")
+    except OSError as error:
+        raise write_error(path, error) from None
     return path
 
 
@@ -158,12 +163,15 @@ class JsonLines:
 
 @contextmanager
 def lock_folder(out: Path) -> Iterator[None]:
-    """Make the folder and lock it; the lock is released when the process ends, even if it is killed.
+    """Make the folder and lock it; the lock is released when the process ends, even if it is killed. If the
+    folder was made here and is still empty at the end of the block, it is removed.
 
-    Raises InputError if another process holds the lock or the folder cannot be made.
+    Raises InputError if another process holds the lock or the folder cannot be made or written into.
     """
+    made = not out.exists()
     try:
         out.mkdir(parents=True, exist_ok=True)
+        TemporaryFile(dir=out).close()
         folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
     except FileExistsError:
         raise InputError(f"cannot use the folder {out}: it is a file") from None
@@ -179,3 +187,6 @@ def lock_folder(out: Path) -> Iterator[None]:
         yield
     finally:
         os.close(folder)
+        if made:
+            with suppress(OSError):  # it is not empty
+                out.rmdir()

@@ -23,7 +23,7 @@ from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.bounds import numbers
 from robotdiffuse.core.errors import InputError, reading, shown
 from robotdiffuse.core.input_files import input_file
-from robotdiffuse.core.output_files import lock_folder, write_atomically
+from robotdiffuse.core.output_files import check_output, lock_folder, write_atomically
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.datasets.rows import Row, resample, row_of
 from robotdiffuse.datasets.shards import (
@@ -226,8 +226,8 @@ def export_npz(folder: str | FilePath, file: str | FilePath) -> tuple[int, int]:
     Raises InputError if there is no data set, if it has no such scene or other numbers of waypoints or
     joints, and if the file cannot be written.
     """
+    file = check_output(file, (".npz",))
     manifest = read_manifest(folder)
-    file = FilePath(file)
     if (manifest.waypoints, manifest.dof) != (WAYPOINTS, DOF):
         raise InputError(
             f"{folder} has {manifest.waypoints} waypoints of {manifest.dof} joints; "

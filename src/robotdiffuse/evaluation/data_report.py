@@ -217,6 +217,7 @@ def write_page(folder: str | FilePath, file: str | FilePath, robot: Robot | None
     matplotlib is not installed, for a file that cannot be written, and in the cases in which `read_figures`
     raises it.
     """
+    read_manifest(folder)
     target = check_output(file, (".html", ".htm"))
     data = read_figures(folder)
     robot = load_robot(data.manifest.robot) if robot is None else robot

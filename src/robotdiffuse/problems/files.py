@@ -13,7 +13,15 @@ from typing import Any
 import yaml
 
 from robotdiffuse.core.errors import InputError, check_type, located, shown, unknown_name
-from robotdiffuse.core.input_files import file_name, no_files, parse_json, parse_yaml, read_text, read_yaml
+from robotdiffuse.core.input_files import (
+    check_ending,
+    file_name,
+    no_files,
+    parse_json,
+    parse_yaml,
+    read_text,
+    read_yaml,
+)
 from robotdiffuse.core.output_files import write_atomically, write_error
 from robotdiffuse.core.settings import Number, converted
 from robotdiffuse.core.transforms import pose_entry
@@ -82,8 +90,7 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
     check_type("index", index, Integral, "a whole number from 0 on")
     if file.is_dir():
         raise InputError(f"{file} is a folder; give a file in it, or the folder to `robotdiffuse bench run`")
-    if file.suffix.lower() not in WRITERS:
-        raise unknown_name(f"problem file format of {file}:", file.suffix, WRITERS)
+    check_ending(file, "problem file", WRITERS)
     text = read_text(file)
     if file.suffix.lower() == ".jsonl":
         lines = _lines(text)
@@ -187,8 +194,7 @@ def save_problem(problem: Problem, file: str | Path, robot: str | None = None) -
     """
     file = file_name(file, "problem file")
     ending = file.suffix.lower()
-    if ending not in WRITERS:
-        raise unknown_name(f"problem file format of {file}:", file.suffix, WRITERS)
+    check_ending(file, "problem file", WRITERS)
     text = WRITERS[ending](problem_record(problem, file.parent, robot))
     if ending != ".jsonl":
         write_atomically(file, text)

@@ -17,7 +17,7 @@ class ServeSettings(Settings):
 
     host: str = "127.0.0.1"
     """Address to listen on."""
-    port: Natural = 8000
+    port: Annotated[int, Bound(least=0.0, most=65535.0)] = 8000
     """TCP port; 0 for any free one."""
     workers: Count = os.cpu_count() or 1
     """Processes that plan."""

@@ -95,7 +95,7 @@ class TrainingSettings(Settings):
 class EncoderTraining(TrainingSettings):
     """Training of an auto-encoder of point clouds alone; it is frozen afterwards (paper, eq. l_AE)."""
 
-    name: Annotated[str, OneOf(ENCODERS)] = "point_autoencoder"
+    name: str = "point_autoencoder"
     """Name of an encoder that is trained alone."""
     minutes: Positive | None = 5.0
     batch: Count = 32
@@ -117,11 +117,7 @@ class EncoderTraining(TrainingSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         alone = [name for name, entry in ENCODERS.items() if entry.kind == "alone"]
-        if self.name not in alone:
-            raise InputError(
-                f"name is {self.name}, an encoder that is trained jointly with the planner, not alone; "
-                f"alone: {', '.join(alone)}"
-            )
+        check_name("encoder that is trained alone", self.name, alone)
 
 
 @dataclass(frozen=True, kw_only=True)

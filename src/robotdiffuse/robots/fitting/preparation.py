@@ -21,6 +21,7 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, check_name
+from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.types import Mask, Points, Poses, Spheres
 from robotdiffuse.robots.bodies import Surface
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, convex_parts
@@ -595,6 +596,9 @@ def add_robot(
             f"robot name is {name!r}; it must be a valid folder name, and no file or bundled robot: give "
             f"--name NAME"
         )
+    folder = user_robots() / name if out is None else Path(out)
+    with lock_folder(folder):  # it can be written
+        pass
     robot = replace(robot, name=name)
     if limits is not None:
         changed, notes = read_limits(limits)
@@ -634,7 +638,6 @@ def add_robot(
         for pair in prepared.sampled
         if semantics is not None and (pair.reason == "checked") == (frozenset(pair.links) in srdf_allowed)
     )
-    folder = user_robots() / name if out is None else Path(out)
     source = {"urdf": Path(urdf).name, "sha256": tree.digest, "license": license}
     shares = {"free": round(measured.free, 4), "refused": round(measured.by_spheres, 4)}
     note = (
