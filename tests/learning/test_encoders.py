@@ -218,7 +218,7 @@ def test_training_alone(name, tmp_path, monkeypatch):
 def test_training_from_the_command_line(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(training, "STANDARDIZATION_SCENES", 32)
     out = str(tmp_path / "out")
-    command = ["train", "encoder", "--samples", "4", "--batch", "2", "--out", out, "--encoder"]
+    command = ["train", "encoder", "--samples", "4", "--batch-size", "2", "--out", out, "--encoder"]
     assert main([*command, "compression_autoencoder"]) == 0
     assert "reconstruction: " in capsys.readouterr().out
     assert load_encoder(out).settings == encoders.CompressionAutoencoderSettings()

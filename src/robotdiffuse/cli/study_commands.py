@@ -127,7 +127,7 @@ TRAINING = (
         ),
     ),
     ("--seed N", "random seed", natural),
-    ("--batch N", "batch size", count),
+    ("--batch-size N", "batch size", count, None, {"dest": "batch"}),
     ("--learning-rate X", "peak learning rate", positive),
     ("--threads N", "number of PyTorch threads", count),
     (

@@ -70,7 +70,7 @@ def test_command(data: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -
     asked = ["train", "baseline", "reversal", "--data", data, "--out", str(tmp_path / "out")]
     assert main([*asked, "--samples", "320"]) == 0
     assert "samples: 320" in capfd.readouterr().out
-    assert main([*asked, "--samples", "320", "--batch", "8"]) == 2
+    assert main([*asked, "--samples", "320", "--batch-size", "8"]) == 2
     assert "is of a run with batch = 16" in capfd.readouterr().err
     assert main(["train", "baseline", "nonsense", "--data", data, "--out", "x"]) == 2
     assert "unknown network 'nonsense'; known: completion, model, mpinets, mpnet" in capfd.readouterr().err
