@@ -120,9 +120,20 @@ def test_failures_say_why(made: Planner) -> None:
 
 def test_bad_input() -> None:
     for call, message in (
-        (lambda made: made.plan_pose([0.5, 0, 0.4], QPOS), "a pose has 3 numbers"),
-        (lambda made: made.plan_pose([0.5, 0, 0.4, *DOWN], QPOS[:8]), "qpos has 8 values; it must have 9"),
-        (lambda made: planner(joint_vel_limits=[1.0]), "there are 1 velocity limits; panda plans 7 joints"),
+        (lambda made: made.plan_pose([0.5, 0, 0.4], QPOS), r"pose is \[0.5, 0, 0.4\]; it must be x, y, z and a quat"),
+        (lambda made: made.plan_pose("here", QPOS), "pose is 'here'; it must be x, y, z and a quaternion"),
+        (lambda made: made.update_attached_box([0.1] * 3, np.zeros((4, 4))), "pose is .*; it must be a homogeneous"),
+        (lambda made: made.plan_pose([0.5, 0, 0.4, *DOWN], QPOS[:8]), "qpos is .*; it must be 9 numbers"),
+        (lambda made: made.plan_pose([0.5, 0, 0.4, *DOWN], "ready"), "qpos is 'ready'; it must be 9 numbers"),
+        (lambda made: made.plan_pose([0.5, 0, 0.4, *DOWN], QPOS, time_step=0), "time_step is 0; it must be"),
+        (lambda made: made.plan_qpos([QPOS, QPOS[:3]], QPOS), "goal_qposes is .*; it must be rows of 9 numbers"),
+        (lambda made: made.IK([0.5, 0, 0.4, *DOWN], QPOS, n_init_qpos="a"), "count is 'a'; it must be an integer"),
+        (lambda made: made.update_point_cloud([[1, 1, 1]], "fine"), "resolution is 'fine'; it must be a number"),
+        (lambda made: planner(joint_vel_limits=[1.0]), r"velocity limits are \[1.0\]; they must be 7 positive numbers"),
+        (lambda made: planner(joint_acc_limits=[-1.0] * 7), "acceleration limits are .*; they must be 7 positive"),
+        (lambda made: planner(user_joint_names="panda_joint1"), "user_joint_names is 'panda_joint1'; it must be a list"),
+        (lambda made: Planner("missing.urdf", HAND), "urdf missing.urdf does not exist"),
+        (lambda made: Planner(__file__, HAND, "missing"), "package_keyword_replacement is 'missing'; it must be a folder"),
         (lambda made: planner(user_joint_names=JOINTS[1:]), "user_joint_names lacks panda_joint1"),
         (lambda made: rd.Workspace(made.robot, "nose"), "unknown link 'nose'"),
     ):

@@ -9,6 +9,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,9 @@ from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.bounds import numbers, positive, rigid_transform
+from robotdiffuse.core.errors import InputError, check_list, shown
+from robotdiffuse.core.input_files import read_bytes
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import inverse, pose, transform
 from robotdiffuse.planning.workspace import Workspace
@@ -47,6 +50,8 @@ TILT_WEIGHT = 0.01
 TILT_MARGIN = 1.25
 # Locked joints, such as fingers, are held at multiples of this [rad] or [m].
 HELD_JOINT_STEP = 0.002
+# Smallest time between two rows of a motion [s].
+MIN_TIME_STEP = 1e-4
 
 
 class Planner:
@@ -79,18 +84,17 @@ class Planner:
         joint_acc_limits: ArrayLike = (),
         **_: Any,
     ) -> None:
+        check_list("user_joint_names", user_joint_names, str, "names of joints")
         robot = _robot(urdf, move_group, srdf, package_keyword_replacement)
         self.joint_names = tuple(user_joint_names) or robot.joint_names
         missing = [name for name in robot.joint_names if name not in self.joint_names]
         if missing:
             raise InputError(f"user_joint_names lacks {', '.join(missing)}, which move {move_group}")
         self._places = [self.joint_names.index(name) for name in robot.joint_names]
-        velocity = np.ravel(joint_vel_limits)
-        acceleration = np.ravel(joint_acc_limits)
         self.robot = _limited(
             robot,
-            velocity if len(velocity) else np.ones(robot.dof),
-            acceleration if len(acceleration) else robot.acceleration,
+            joint_vel_limits if np.size(joint_vel_limits) else np.ones(robot.dof),
+            joint_acc_limits if np.size(joint_acc_limits) else robot.acceleration,
         )
         self.workspace = Workspace(self.robot, move_group)
         """The robot and its obstacles. Add obstacles other than point clouds by `planner.workspace.add`."""
@@ -102,7 +106,7 @@ class Planner:
 
     @joint_vel_limits.setter
     def joint_vel_limits(self, values: ArrayLike) -> None:
-        self._limit(np.ravel(values), self.robot.acceleration)
+        self._limit(values, self.robot.acceleration)
 
     @property
     def joint_acc_limits(self) -> ndarray:
@@ -111,9 +115,9 @@ class Planner:
 
     @joint_acc_limits.setter
     def joint_acc_limits(self, values: ArrayLike) -> None:
-        self._limit(self.robot.velocity, np.ravel(values))
+        self._limit(self.robot.velocity, values)
 
-    def _limit(self, velocity: ndarray, acceleration: ndarray) -> None:
+    def _limit(self, velocity: ArrayLike, acceleration: ArrayLike) -> None:
         self.robot = _limited(self.robot, velocity, acceleration)
         self.workspace.robot = _limited(self.workspace.robot, velocity, acceleration)
 
@@ -135,7 +139,8 @@ class Planner:
             resolution: Radius of the sphere around each point [m].
             name: Name of the cloud.
         """
-        self.workspace.add(PointCloud(np.asarray(points, float), max(resolution, 1e-3), name=name))
+        radius = max(positive(CLOUD, "resolution", resolution), 1e-3)
+        self.workspace.add(PointCloud(points, radius, name=name))
 
     def remove_point_cloud(self, name: str = CLOUD) -> bool:
         """Remove a point cloud; returns whether there was one."""
@@ -208,7 +213,10 @@ class Planner:
 
     def plan_qpos(self, goal_qposes: Any, current_qpos: ArrayLike, **options: Any) -> dict[str, Any]:
         """Plan to any of several configurations; see `plan_pose`."""
-        goals = np.atleast_2d(np.asarray(goal_qposes, float))
+        goals = np.atleast_2d(_array(goal_qposes))
+        if goals.ndim > 2 or goals.shape[1] not in (self.robot.dof, len(self.joint_names)):
+            what = f"rows of {len(self.joint_names)} numbers, the values of {', '.join(self.joint_names)}"
+            raise InputError(f"goal_qposes is {shown(goal_qposes)}; it must be {what}")
         ends = goals if goals.shape[1] == self.robot.dof else goals[:, self._places]
         plan = partial(self.workspace.plan, JointGoal(ends))
         return self._planned("planning failed", plan, current_qpos, options)
@@ -261,6 +269,9 @@ class Planner:
         the start. The last row is repeated for SETTLING_TIME, since scripts grasp and release right after
         the motion."""
         start = self._start(qpos)
+        step = options.get("time_step", 0.1)
+        if positive("options", "time_step", step) < MIN_TIME_STEP:
+            raise InputError(f"time_step is {step}; it must be at least {MIN_TIME_STEP} s")
         try:
             result = plan(start, time_limit=options.get("planning_time", 1.0))
         except InputError as error:
@@ -268,7 +279,6 @@ class Planner:
         trajectory = result.trajectory
         if trajectory is None:
             return {"status": f"{failed}: {result.reason}"}
-        step = options.get("time_step", 0.1)
         times = step * np.arange(1, np.ceil((trajectory.duration + SETTLING_TIME) / step) + 1)
         state = trajectory.at(np.minimum(times, trajectory.duration))
         return {
@@ -304,12 +314,14 @@ class Planner:
     def _start(self, qpos: ArrayLike) -> ndarray:
         """The planned joints of `qpos`. Its other joints, such as fingers, are locked at their values in
         `qpos`, rounded to multiples of HELD_JOINT_STEP."""
-        q = np.ravel(np.asarray(qpos, float))
+        q = np.ravel(_array(qpos))
         if len(q) == self.robot.dof:
             return q
         if len(q) != len(self.joint_names):
             names = ", ".join(self.joint_names)
-            raise InputError(f"qpos has {len(q)} values; it must have {len(self.joint_names)}: {names}")
+            raise InputError(
+                f"qpos is {shown(qpos)}; it must be {len(self.joint_names)} numbers, the values of {names}"
+            )
         values = dict(zip(self.joint_names, q.tolist(), strict=True))
         robot = self.workspace.robot
         locked = {
@@ -343,14 +355,14 @@ def matrix(value: Any) -> ndarray:
     """The homogeneous transform of a pose: an object with `p` and `q`, seven numbers, or 4 x 4 numbers."""
     if hasattr(value, "p") and hasattr(value, "q"):
         value = [*np.ravel(value.p), *np.ravel(value.q)]
-    numbers = np.asarray(value, float)
-    if numbers.shape == (4, 4):
-        return numbers
-    if numbers.size != 7:
+    given = _array(value)
+    if given.shape == (4, 4):
+        return rigid_transform("pose", given)
+    if given.size != 7:
         raise InputError(
-            f"a pose has {numbers.size} numbers; it must be x, y, z and a quaternion w, x, y, z, or 4 x 4"
+            f"pose is {shown(value)}; it must be x, y, z and a quaternion w, x, y, z, or 4 x 4 numbers"
         )
-    flat = numbers.ravel()
+    flat = given.ravel()
     return pose(flat[:3], wxyz=flat[3:])
 
 
@@ -358,24 +370,37 @@ def _robot(urdf: str | Path, tip: str, srdf: str | Path, package: str) -> Robot:
     """The prepared robot. A URDF with new content is prepared first, and stored in the user's robots."""
     if str(urdf) in ROBOTS:
         return load_robot(str(urdf))
-    content = Path(urdf).read_bytes() + (Path(srdf).read_bytes() if srdf else b"") + tip.encode()
+    content = read_bytes(urdf, "urdf") + (read_bytes(srdf, "srdf") if srdf else b"") + tip.encode()
     folder = user_robots() / f"{Path(urdf).stem}-{hashlib.sha256(content).hexdigest()[:8]}"
     if (folder / ROBOT_FILE).is_file():
         return load_robot(folder)
     packages: dict[str, str | Path] = {}
     if package:
+        if not Path(package).is_dir():
+            raise InputError(f"package_keyword_replacement is {shown(package)}; it must be a folder")
         packages = {entry.name: entry for entry in Path(package).iterdir() if entry.is_dir()}
     return add_robot(urdf, tip=tip, srdf=srdf or None, packages=packages, out=folder).robot
 
 
-def _limited(robot: Robot, velocity: ndarray, acceleration: ndarray) -> Robot:
+def _limited(robot: Robot, velocity: ArrayLike, acceleration: ArrayLike) -> Robot:
     """The robot with these limits of its planned joints, and the jerk limits that follow from RAMP_TIME."""
     limits = dict[str, dict[str, float]]()
-    jerk = acceleration / RAMP_TIME
-    for field, values in (("velocity", velocity), ("acceleration", acceleration), ("jerk", jerk)):
-        if len(values) != robot.dof:
-            raise InputError(f"there are {len(values)} {field} limits; {robot.name} plans {robot.dof} joints")
+    for field, given in (("velocity", velocity), ("acceleration", acceleration)):
+        values = np.ravel(_array(given))
+        if len(values) != robot.dof or not ((values > 0) & (values < inf)).all():
+            raise InputError(
+                f"{field} limits are {shown(given)}; they must be {robot.dof} positive numbers, one for each "
+                "planned joint"
+            )
         for name, value in zip(robot.joint_names, values.tolist(), strict=True):
             limits.setdefault(name, {})[field] = value
+    for entry in limits.values():
+        entry["jerk"] = entry["acceleration"] / RAMP_TIME
     joints = tuple(replace(joint, **limits.get(joint.name, {})) for joint in robot.joints)
     return replace(robot, joints=joints)
+
+
+def _array(value: object) -> ndarray:
+    """The value as an array of numbers; empty if it is none."""
+    array = numbers(value)
+    return np.zeros(0) if array is None else array

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from numbers import Real
 from typing import Annotated, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -96,6 +97,8 @@ def time_left(time_limit: float, began: float) -> float:
 
     At least MIN_TIME_LIMIT, or the time limit itself if it is less.
     """
+    if not isinstance(time_limit, Real):
+        return time_limit  # `PlanRequest` refuses it
     return min(time_limit, max(time_limit - (clock() - began), MIN_TIME_LIMIT))
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from numbers import Integral
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -89,8 +90,8 @@ def inverse_kinematics(
             is not a finite rigid transform.
     """
     settings = settings or InverseKinematicsSettings()
-    if count < 1:
-        raise InputError(f"inverse kinematics: count is {count}; it must be at least 1")
+    if not isinstance(count, Integral) or count < 1:
+        raise InputError(f"inverse kinematics: count is {shown(count)}; it must be an integer of at least 1")
     target = rigid_transform("inverse kinematics: T_base_frame", T_base_frame)
     arm, chain = ik_chain(robot, frame, LIMIT_MARGIN)
     accepted = np.zeros((0, robot.dof))
