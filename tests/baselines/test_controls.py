@@ -47,6 +47,7 @@ def test_the_nearest_motions_are_bent_to_start_and_goal(monkeypatch: pytest.Monk
     # backwards, by half of each difference
     np.testing.assert_allclose(first, np.stack([start, [1.5, 0.55], goal]))
     np.testing.assert_allclose(second[[0, -1]], [start, goal])
+    monkeypatch.setattr(controls, "read_manifest", lambda data: None)
     monkeypatch.setattr(controls, "library", lambda data, robot: np.stack([[LEFT, RIGHT]] * 2))
     control = controls.Control(controls.ControlSettings(source=controls.NEAREST, data="data", samples=1, guidance_steps=0))
     q = control.candidates(LEFT, RIGHT[None], CollisionChecker(PANDA, WALL), np.random.default_rng(0))

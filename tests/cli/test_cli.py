@@ -79,6 +79,8 @@ BAD_CALL = {
     "an encoder that is none": (["train", "encoder", "--encoder", "e", "--out", "o"], "trained alone 'e'; known:"),
     "training without data": (["train", "planner", "--data", "d", "--out", "o"], "no data set"),
     "problems that are none": (["bench", "run", "--planners", "aorrtc", "--problems", "p", "--out", "o"], "'p' are neither"),
+    "a control without its data": (["reproduce", "table1", "--data", "d", "--out", "o"], "there is no d/manifest.json"),
+    "an encoder for data to come": (["train", "planner", "--robot", "panda", "--encoder", "e", "--out", "o"], "e holds no"),
     "workers for existing data": ([*TRAIN, "--workers", "2"], "--workers is for data to be generated"),
 }  # fmt: skip
 

@@ -18,7 +18,7 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, OneOf, Settings
 from robotdiffuse.core.types import Configuration, Configurations
 from robotdiffuse.datasets.rows import read_rows
-from robotdiffuse.datasets.shards import SPLITS
+from robotdiffuse.datasets.shards import SPLITS, read_manifest
 from robotdiffuse.learning.guidance import CollisionGuidance, Trajectories
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import nearest_goals
@@ -66,6 +66,8 @@ class ControlSettings(Settings, name="control"):
         super().__post_init__()
         if (self.source == NEAREST) != (self.data is not None):
             raise InputError(f"source is {self.source} and data is {self.data}; {NEAREST} alone needs data")
+        if self.data is not None:
+            read_manifest(self.data)
 
 
 class Control(Planner[ControlSettings]):

@@ -20,7 +20,7 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 
 with needs("torch", "train"):
-    from robotdiffuse.learning.checkpoint import export_weights, load_network, save_network
+    from robotdiffuse.learning.checkpoint import export_weights, load_encoder, load_network, save_network
     from robotdiffuse.learning.denoisers import DENOISERS, PAPER_SIZES
     from robotdiffuse.learning.training.completion import CompletionTraining, train_completion
     from robotdiffuse.learning.training.config import (
@@ -30,6 +30,7 @@ with needs("torch", "train"):
         one_length,
         planner_training,
     )
+    from robotdiffuse.learning.training.loop import Processes
     from robotdiffuse.learning.training.tasks import (
         baseline_training,
         train_baseline,
@@ -182,8 +183,8 @@ def train_for_robot(
     `make_settings` completes. out: working folder; None: beside the user's robots. motions: number of motions
     to generate; workers: number of processes that generate them.
 
-    Raises InputError for an unknown robot, a folder that was made with other settings, and too little disk
-    space.
+    Raises InputError for an unknown robot, a missing device or encoder, a folder that was made with other
+    settings, and too little disk space.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise InputError("torchrun only trains: generate the data first, then give --data")
@@ -198,6 +199,9 @@ def train_for_robot(
     settings: PlannerTraining = make_settings(
         defaults | options | {"data": str(work / "data"), "robot": source}
     )
+    Processes(settings.device)
+    if "encoder" in options and settings.encoder is not None and not settings.jointly:
+        load_encoder(settings.encoder)
     print(
         f"{robot.name}: {data.trajectories:,} motions, then training; all in {work}",
         file=sys.stderr,

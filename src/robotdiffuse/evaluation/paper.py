@@ -312,9 +312,10 @@ def run_table1(settings: Table1Settings, report: Progress, done: Done) -> Bench:
     """
     if settings.paper_weights is not None:
         _check_paper_weights(settings.paper_weights, settings.time_limit)
+    bench = settings.bench
     write_problems(settings.out, settings.problems, report)
-    run_bench(settings.bench, report, done)
-    return read_bench(settings.out, list(settings.bench.specs))
+    run_bench(bench, report, done)
+    return read_bench(settings.out, list(bench.specs))
 
 
 def _title(folder: str) -> str:
