@@ -164,7 +164,7 @@ def test_a_row_that_is_not_written_whole_is_dropped(tmp_path: Path, monkeypatch:
     lines.append({"a": 1})
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", Mock(side_effect=FULL))
-        with pytest.raises(OSError, match="No space"):
+        with pytest.raises(OutputError, match=r"a\.jsonl cannot be written: No space"):
             lines.append({"a": 2})
     lines.append({"a": 3})
     assert lines.rows == JsonLines(tmp_path / "a.jsonl").rows == [{"a": 1}, {"a": 3}]

@@ -140,7 +140,10 @@ class JsonLines:
     def append(self, row: dict[str, Any]) -> None:
         """Add a row and flush it to the disk. If writing fails, the row is in neither the file nor `rows`."""
         if self._file is not None:
-            self._write(self._file, json.dumps(row) + "\n")
+            try:
+                self._write(self._file, json.dumps(row) + "\n")
+            except OSError as error:
+                raise write_error(self._file, error) from None
         self.rows.append(row)
 
     def _write(self, file: Path, line: str) -> None:
