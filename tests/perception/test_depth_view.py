@@ -54,7 +54,7 @@ def test_what_is_refused() -> None:
         ({"intrinsics": (1.0, 1.0)}, "view.intrinsics is .* 4 finite numbers"),
         ({"intrinsics": {"fx": 1.0}}, r"view\.intrinsics has \['fx'\]; it must have fx, fy, cx, cy"),
         ({"intrinsics": [[460.0, 1, 319.5], [0, 461.0, 239.5], [0, 0, 1]]}, "without skew"),
-        ({"T_base_camera": 2 * np.eye(4)}, "it must be a rotation"),
+        ({"T_base_camera": 2 * np.eye(4)}, "it must be a homogeneous transform"),
         ({"configuration": [np.nan]}, "view.configuration"),
         ({"range": "far"}, "view.range is 'far'; it must be a number"),
         ({"noise": 0.01}, "noise is 0.01; it must be what rd.measure_noise returns"),

@@ -106,7 +106,7 @@ class Control(Planner[ControlSettings]):
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        candidates = self.candidates(*start_goal.rows(), start_goal.checker, context.rng)
+        candidates = self.candidates(*start_goal.leads(), start_goal.checker, context.rng)
         for batch in (straight_lines(start_goal), candidates):
             result = shortest_accepted(context, start_goal, batch, self.settings.source)
             if result is not None:

@@ -145,7 +145,7 @@ class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
         """See `planning.planner.Planner`."""
         prior = self.network(context.problem.robot)
         samples = self.settings.samples
-        start, goals = start_goal.rows()
+        start, goals = start_goal.leads()
         goals = nearest_goals(start, goals, samples)
         ends = np.repeat(start[None], samples, 0), goals[np.arange(samples) % len(goals)]
         levels = self.levels(prior.schedule, self.settings.sampling_steps)

@@ -97,7 +97,7 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
         first = tried == 0
         count = 1 if first else settings.batch
         space = search_space(start_goal.checker, settings.resolution)
-        start, goals = start_goal.rows()
+        start, goals = start_goal.leads()
         order = np.argsort(np.linalg.norm(goals - start, axis=1), kind="stable")
         goal = goals[order[np.arange(tried, tried + count) % len(order)]]
         cloud = network.settings.region, network.settings.scene_points

@@ -120,7 +120,7 @@ class NeuralPlanning:
         self.space = start_goal.space(settings.resolution, settings.clearance)
         self.generator = network.generator(int(rng.integers(2**63)))
         self.state = random_state(int(rng.integers(2**31)))
-        start, goals = start_goal.rows()
+        start, goals = start_goal.leads()
         self.starts = np.tile(start, (settings.attempts, 1))
         self.goals = goals[(np.arange(settings.attempts) + rng.integers(len(goals))) % len(goals)]
         [cloud] = scene_clouds(start_goal.checker, network.region, network.settings.points, 1, rng)

@@ -189,7 +189,7 @@ class OmplPlanner(Planner[OmplSettings]):
         problem = context.problem
         settings = self.settings
         attempt = 0
-        start, goals = start_goal.rows()
+        start, goals = start_goal.leads()
         nearest = float(np.linalg.norm(goals - start, axis=1).min())
         target_length = (1 + OPTIMAL) * max(nearest, SAME_STATE_DISTANCE)
         best = None
@@ -311,7 +311,7 @@ class _Search:
         self._information.setStateValidityChecker(self._validity)
         self._information.setMotionValidator(self._motions)
         self._information.setup()
-        start, goals = start_goal.rows()
+        start, goals = start_goal.leads()
         self._backwards = planner.backwards
         first, last = (goals, start[None]) if self._backwards else (start[None], goals)
         self._goals = ob.GoalStates(self._information)

@@ -39,7 +39,7 @@ def shortest_accepted(
 
 def straight_lines(start_goal: StartGoal) -> ndarray:
     """The straight lines from the start to the goals [goals, 2, dof]."""
-    start, goals = start_goal.rows()
+    start, goals = start_goal.leads()
     return np.stack([np.broadcast_to(start, goals.shape), goals], axis=1)
 
 

@@ -12,7 +12,7 @@ Rows = tuple[Any, ...]
 
 
 class Group(NamedTuple):
-    """Options below a title, or without one, of which at most one may be given."""
+    """Options below a title; without a title, options of which at most one may be given."""
 
     title: str | None
     rows: Rows

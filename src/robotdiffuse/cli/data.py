@@ -92,7 +92,7 @@ def _gallery_entries(folder: Path, robot: Robot, number: int, seed: int) -> Iter
 def run_export(arguments: Namespace) -> None:
     count, left_out = export_npz(arguments.folder, arguments.file)
     print(
-        f"wrote {arguments.file}: {count:,} motions; {left_out:,} others have other scenes than two spheres"
+        f"wrote {arguments.file}: {count:,} motions; {left_out:,} left out, whose scenes are not two spheres"
     )
 
 

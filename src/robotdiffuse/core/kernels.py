@@ -112,7 +112,7 @@ def _folder_name(module: str) -> str:
 
 def _compiled_from(module: str) -> set[str]:
     """The modules with code or constants that are compiled into a module: the module, the modules of the
-    package that it imports, and the imports of imported modules with compiled code."""
+    package that it imports, and so on through those of them that import `core.kernels`."""
     modules: set[str] = set()
     waiting = [module]
     while waiting:
@@ -199,8 +199,8 @@ class _Cache(caching.FunctionCache):
 
     @contextmanager
     def _guard_against_spurious_io_errors(self) -> Iterator[None]:
-        """Around reading and writing: after an error, the function's cached code is dropped, so that it is
-        compiled again. A full disk is not an error."""
+        """Around reading and writing: an error, a full disk too, is ignored, and the function's cached code
+        is dropped, so that it is compiled again."""
         try:
             yield
         except Exception:  # pickle raises errors of many kinds
@@ -246,8 +246,8 @@ def inner_kernel(**options: Any) -> Callable[[Callable], Any]:
     """A decorator that compiles a function that only compiled code calls.
 
     The wrapper by which Python would call the function is left out: for robots and scenes, which are tuples
-    of many arrays, the wrapper takes a quarter of the compile time. Numba also compiles a called function as
-    a part of its caller, so functions with one caller should be inlined (`inline="always"`).
+    of many arrays, the wrapper takes a quarter of the compile time. Numba compiles a called function by
+    itself, and again as a part of each caller; with a single caller, `inline="always"` saves the first.
     """
 
     def compiled(function: Callable) -> Any:
@@ -256,7 +256,7 @@ def inner_kernel(**options: Any) -> Callable[[Callable], Any]:
         def refuse(*_: Any, **__: Any) -> None:
             raise TypeError(f"{function.__name__} is an inner kernel: only compiled code calls it")
 
-        # Without registered code, a call from Python asks for compilation, and `refuse` raises an error. A
+        # `_insert` registers no code, so a call from Python goes to `_compile_for_args`, which refuses it. A
         # call of code without a wrapper would end the process.
         dispatcher._insert = lambda *_: None
         dispatcher._compile_for_args = refuse

@@ -1,13 +1,13 @@
 """Guidance: steps down a sum of cost functions, on predicted trajectories (paper, Motion Guided Generation).
 
-The same steps serve in two places: a few of them inside the sampler, on the predicted clean trajectory
-(guidance), and more of them on its output (refinement). The costs of waypoints q_i, with the paper's hinge
-h = max(S - D, 0) of a safe distance S and a distance D:
+The same steps serve in two places: a few of them inside the sampler, on the predicted clean trajectory, and
+more of them on motions that no network made (`baselines/controls.py`). The costs of waypoints q_i, with the
+paper's hinge h = max(S - D, 0) of a safe distance S and a distance D:
 
 | cost           | formula                                                             | enabled by  |
 |----------------|---------------------------------------------------------------------|-------------|
 | collision      | sum of h^2 / 2 over covering spheres; D: from sphere to scene       | margin (S)  |
-| self_collision | sum of h^2 / 2 over pairs of links; D: between the two links        | self_margin |
+| self_collision | sum of h^2 / 2 over pairs of spheres of two links; D: between both  | self_margin |
 | length         | sum of |q_(i+1) - q_i|^2 / 2                                        | length      |
 
 The first two costs depend on single waypoints. Each waypoint is pushed by the smallest motion that clears a
@@ -16,8 +16,8 @@ of CHOMP does (Zucker et al., IJRR 2013). The cost of length is CHOMP's smoothne
 step moves each waypoint towards the middle of its two neighbors.
 
 A problem's path constraints are one more cost: the sum of h^2 / 2 over their rows (scalar constraints), where
-h is how far the value of a row exceeds `tolerance_share` times the row's tolerance, see `CollisionGuidance`
-[m]; a radian counts as `projection_kernel.ANGLE_WEIGHT` meters.
+h [m] is how far the value of a row exceeds its limit, less the part 1 - `tolerance_share` of its tolerance; a
+radian counts as `projection_kernel.ANGLE_WEIGHT` meters.
 """
 
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ class Steps(NamedTuple):
     """Margin between links [m], or OFF."""
     push: np.float32
     """Longest push of a waypoint [rad]."""
-    kernel: Float[ndarray, "waypoints waypoints"]
+    spread_weights: Float[ndarray, "waypoints waypoints"]
     """Weights by which pushes spread over neighboring waypoints."""
     length: np.float32
     """Fraction of the way to the middle of its neighbors by which a waypoint moves."""
@@ -93,7 +93,7 @@ def descend(robot, scene, q, lower, upper, steps, rounds):
             costs[b] = total
             if pushed and total <= _ZERO:
                 break
-            _spread(q[b], first, last, pushes, active, steps.kernel, lower, upper)
+            _spread(q[b], first, last, pushes, active, steps.spread_weights, lower, upper)
             _shorten(q[b], first, last, steps.length)
     return costs
 
@@ -120,20 +120,20 @@ def _push_away(cost, gradient, push, out):
 
 
 @allocation_free(fastmath=True)
-def _spread(q, first, last, pushes, active, kernel, lower, upper):
+def _spread(q, first, last, pushes, active, spread_weights, lower, upper):
     """Moves each of the waypoints `first` to `last` - 1 by a weighted mean of its neighbors' pushes; by less
     if only distant neighbors are pushed."""
     dof = q.shape[1]
     for i in range(first, last):
         weight = _ZERO
         for k in range(first, last):
-            weight += kernel[i, k] * active[k]
+            weight += spread_weights[i, k] * active[k]
         if weight <= np.float32(1e-4):
             continue
         weight = _ONE / max(weight, _ONE)
         for k in range(first, last):
-            if active[k] > _ZERO and kernel[i, k] > np.float32(1e-3):
-                share = weight * kernel[i, k]
+            if active[k] > _ZERO and spread_weights[i, k] > np.float32(1e-3):
+                share = weight * spread_weights[i, k]
                 for j in range(dof):
                     q[i, j] += share * pushes[k, j]
         for j in range(dof):
@@ -207,7 +207,7 @@ class CollisionGuidance:
             margin=OFF if settings.margin is None else np.float32(settings.margin) + checker.padding,
             self_margin=OFF if settings.self_margin is None else np.float32(settings.self_margin),
             push=np.float32(settings.push),
-            kernel=spread,
+            spread_weights=spread,
             length=np.float32(settings.length),
         )
         costs = np.zeros(len(q), np.float32)
@@ -224,8 +224,8 @@ class CollisionGuidance:
 
 @kernel(nogil=True)
 def _towards_constraints(rows, limits, q, max_step):
-    """Moves each configuration of q [n, dof] by a Gauss-Newton step down the cost of the constraints, in
-    place; max_step: longest step [rad]."""
+    """Moves each configuration of q [n, dof] that exceeds its limits by a damped Newton step towards values
+    within them, in place; max_step: longest step [rad]."""
     work = make_work(rows)
     for i in range(len(q)):
         step(rows, limits, q[i], max_step, work)

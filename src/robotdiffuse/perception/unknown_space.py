@@ -126,7 +126,7 @@ class UnknownSpace:
     def __init__(
         self,
         robot: Robot,
-        occupied_by_arm: Iterable[Configuration],
+        free_configurations: Iterable[Configuration],
         unknown: Voxels,
         predicted: Probabilities | None,
         margin: float = CARVING_MARGIN,
@@ -134,7 +134,7 @@ class UnknownSpace:
         lost: Voxels | None = None,
     ) -> None:
         """
-        occupied_by_arm: configurations at which the arm is known to be free: the start and the goals.
+        free_configurations: configurations at which the arm is known to be free: the start and the goals.
         unknown: the voxels of the grid that no view saw.
         predicted: the probability that each voxel is occupied; None without a prediction.
         margin: voxels nearer to the arm at these configurations than this count as occupied by it [m].
@@ -143,7 +143,7 @@ class UnknownSpace:
         self._robot = robot
         self._grid = grid
         self._lost = lost
-        self._elsewhere = ~grid.filled(robot, occupied_by_arm, margin)
+        self._elsewhere = ~grid.filled(robot, free_configurations, margin)
         self.unknown = unknown & self._elsewhere
         self.probability = None if predicted is None else np.where(self.unknown, predicted, np.float32(0))
 
@@ -194,7 +194,7 @@ RATES: dict[str, float] = {
     "unknown is occupied": 0.99,
 }
 """For each assumption, the fraction of the motions planned under it without a prediction that were free in
-the true scene. `python benchmarks/cameras.py --fit` prints these for the calibration half of its problems."""
+the true scene. `python benchmarks/cameras.py --fit` prints these from its problems with even numbers."""
 
 UNSEEN_CONFIDENCE = 0.5
 """Largest confidence of a motion with an unseen share above MAX_UNSEEN_SHARE."""

@@ -1,5 +1,5 @@
 """What a camera would see from a pose: the voxels that neither the arm nor other voxels hide; and which of
-the small balls that cover the arm's surface are seen to be empty."""
+the small balls that would cover the arm's surface at a goal an image shows to be empty."""
 
 from itertools import product
 
@@ -22,8 +22,8 @@ from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 
 OCCLUSION_START = np.float32(2.0)
-"""Voxels nearer than this to a voxel are not counted as hiding it: they are likely unknown too, and a view
-would show all of them or none [edges of voxels]."""
+"""Distance [edges of voxels] within which other voxels do not count as hiding a voxel: they are likely
+unknown too, and a view would show all of them or none."""
 MIN_VISIBILITY = np.float32(0.02)
 """Smaller probabilities that a voxel is visible count as zero."""
 ARM_CELL = 16
@@ -36,10 +36,10 @@ def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, 
     voxel.
 
     robot: RobotArrays. configurations: float32[m, dof], the arm's for each camera. poses: [m, 4, 4],
-    T_base_camera. intrinsics: fx, fy, cx, cy. size: height and width of the image. reach: farther voxels are
-    not seen [m]. voxels: int64[n, 3], their indices. weights: [n]. filled: [nx, ny, nz], the probability that
-    a voxel is occupied and hides what is behind it. low: lower corner of the grid [m]. edge: edge of a voxel
-    [m].
+    T_base_camera. intrinsics: fx, fy, cx, cy. size: height and width of the image. reach: largest depth along
+    the optical axis at which voxels are seen [m]. voxels: int64[n, 3], their indices. weights: [n]. filled:
+    [nx, ny, nz], the probability that a voxel is occupied and hides what is behind it. low: lower corner of
+    the grid [m]. edge: edge of a voxel [m].
     """
     fx, fy, cx, cy = intrinsics
     half = np.float32(0.5)

@@ -127,7 +127,7 @@ class Diffusion(ExportedPlanner[DiffusionSettings]):
         """See `planning.planner.Planner`."""
         model = self.network(context.problem.robot)
         rng = context.rng
-        start, goals = start_goal.rows()
+        start, goals = start_goal.leads()
         embedding = encode(model, start_goal.checker, self.settings.points, rng)
         names = context.problem.robot.joint_names
         constraints = context.validator.constraints

@@ -47,7 +47,8 @@ def plan_many(
     A problem that raises an error, or kills its process, gets a result with status ERROR; planning of the
     other problems continues. On a cluster, a problem that kills its process ends the call. Each process loads
     its compiled code before its first problem, outside the time limit. Processes import the main script, so
-    its statements must be below `if __name__ == "__main__":`; otherwise all results have status ERROR.
+    its call of `plan_many` must be below `if __name__ == "__main__":`; otherwise all results have status
+    ERROR.
 
     Args:
         problems: The problems.
@@ -111,14 +112,14 @@ def _reported(results: Results, total: int, progress: Callable[[int, int], objec
 
 
 def _planned(
-    problems: list[Problem], loaded: PlannerArguments, workers: int, request: PlanRequest
+    problems: list[Problem], arguments: PlannerArguments, workers: int, request: PlanRequest
 ) -> Results:
     # Each process gets each robot once, without cached arrays; the process computes and caches its own
     # arrays.
     robots = list(dict.fromkeys(problem.robot for problem in problems))
     number = {robot: i for i, robot in enumerate(robots)}
     bare = [replace(robot) for robot in robots]
-    with Workers(workers, _prepare, (loaded, bare, request)) as pool:
+    with Workers(workers, _prepare, (arguments, bare, request)) as pool:
         calls = {}
         for i, problem in enumerate(problems):
             values = {
@@ -136,16 +137,16 @@ def _planned(
                 reason = "the process of the planner died while planning this problem"
             if isinstance(error, NotStartedError):
                 reason = str(error)
-            yield calls[call], _error(loaded[0], problem, reason, request)
+            yield calls[call], _error(arguments[0], problem, reason, request)
 
 
 def _planned_on_cluster(
-    problems: list[Problem], loaded: PlannerArguments, cluster: str, request: PlanRequest
+    problems: list[Problem], arguments: PlannerArguments, cluster: str, request: PlanRequest
 ) -> Results:
     bare = {robot: replace(robot) for robot in {problem.robot for problem in problems}}
     sent = [replace(problem, robot=bare[problem.robot]) for problem in problems]
     calls = [
-        (loaded, request, sent[i : i + PROBLEMS_PER_TASK]) for i in range(0, len(sent), PROBLEMS_PER_TASK)
+        (arguments, request, sent[i : i + PROBLEMS_PER_TASK]) for i in range(0, len(sent), PROBLEMS_PER_TASK)
     ]
     with closing(CLUSTERS[cluster](_plan_on_node, calls)) as batches:
         for number, results in batches:
@@ -154,15 +155,15 @@ def _planned_on_cluster(
 
 
 def _plan_on_node(
-    loaded: PlannerArguments, request: PlanRequest, problems: list[Problem]
+    arguments: PlannerArguments, request: PlanRequest, problems: list[Problem]
 ) -> list[PlanResult]:
-    session = _Session(loaded, request)
+    session = _Session(arguments, request)
     results = []
     for problem in problems:
         try:
             results.append(session.plan(problem))
         except Exception as error:
-            results.append(_error(loaded[0], problem, f"{type(error).__name__}: {error}", request))
+            results.append(_error(arguments[0], problem, f"{type(error).__name__}: {error}", request))
     return results
 
 
@@ -173,8 +174,8 @@ def _error(planner: str, problem: Problem, reason: str, request: PlanRequest) ->
 class _Session:
     """A loaded planner, which compiles its code before the first problem of each robot."""
 
-    def __init__(self, loaded: PlannerArguments, request: PlanRequest) -> None:
-        self.planner = load_planner(*loaded)
+    def __init__(self, arguments: PlannerArguments, request: PlanRequest) -> None:
+        self.planner = load_planner(*arguments)
         self.request = request
         self.warm = set[Robot]()
 
@@ -190,9 +191,9 @@ class _Session:
 _state: tuple[_Session, list[Robot]] | None = None
 
 
-def _prepare(loaded: PlannerArguments, robots: list[Robot], request: PlanRequest) -> None:
+def _prepare(arguments: PlannerArguments, robots: list[Robot], request: PlanRequest) -> None:
     global _state
-    _state = _Session(loaded, request), robots
+    _state = _Session(arguments, request), robots
 
 
 def _plan(robot: int, values: dict[str, Any]) -> PlanResult:

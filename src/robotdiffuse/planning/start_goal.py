@@ -28,17 +28,18 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.compiled_constraints import PathConstraints
 
 GOAL_TIME_FRACTION = 0.5
-"""Fraction of the time limit after which no more of several goals are tried. The first pass over the goals
-ends then only if a free goal was found."""
+"""After this fraction of the time limit, no further ones of several goals are tried. But the first pass over
+the goals goes on until one is free, and the second tries at least one."""
 NEAR_POSE_FRACTIONS = (0.1, 0.3, 0.9)
-"""If a pose cannot be reached exactly, inverse kinematics tries these fractions of the validator's goal
-tolerances, in this order."""
+"""If no configuration reaches a pose exactly, configurations are projected onto the pose with these fractions
+of the validator's goal tolerances, in this order."""
 NEAR_POSE_ROUNDS = 2
 """Number of rounds of seeds for each of NEAR_POSE_FRACTIONS."""
 FIRST_TRY_COUNT = 3
 """Number of configurations to find for each of several poses in the first pass."""
 MANY_GOALS = 8
-"""If there are at least this many poses of a link, the first pass uses the same seeds for all of them."""
+"""If there are at least this many goals, all of them poses of one link without tolerances, and no path
+constraints, the first pass uses the same seeds for all."""
 # A configuration of a pose may be free although its covering spheres collide. At most MAX_EXACT_GOALS such
 # configurations are checked with exact meshes, and at most MAX_GRAZING_GOALS of them become goals.
 MAX_EXACT_GOALS = 20
@@ -94,7 +95,7 @@ class StartGoal:
         self.goals = [goal for goal, lead in zip(goal_images, leads, strict=True) if lead is not None]
         self.goal_leads = [lead for lead in leads if lead is not None]
 
-    def rows(self) -> tuple[Configuration, Configurations]:
+    def leads(self) -> tuple[Configuration, Configurations]:
         """Give the leads to compiled code.
 
         Returns:
@@ -116,7 +117,7 @@ class StartGoal:
         Returns:
             The robot and the scene for `collision.kernels.motions.motions_free`.
         """
-        start, goals = self.rows()
+        start, goals = self.leads()
         states = np.concatenate([start[None], goals])
         return self._within(padded_space(self.checker, states, resolution, clearance), states)
 
@@ -196,9 +197,10 @@ def images(robot: Robot, start: Configuration, goal: Configuration) -> list[Conf
 def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
     """The start and the goals for the search of a call; a failed result if there are none.
 
-    A pose gives up to `pose_goals.GOAL_COUNT` configurations by inverse kinematics. Configurations whose
-    covering spheres are free are preferred over those of which only the exact meshes are free. Several goals
-    are tried with little work each; only if none is free, they are tried again with more.
+    A pose gives up to `pose_goals.GOAL_COUNT` configurations whose covering spheres are free, up to
+    MAX_GRAZING_GOALS nearer ones of which only the exact meshes are free, and copies of these with whole
+    turns. Of joint goals, those of which only the meshes are free are used if the spheres of none are free.
+    Several goals are tried with little work each; only if none is free, they are tried again with more.
     """
     checker = CollisionChecker(context.problem.robot, context.problem.scene)
     goals = _usable_goals(context, checker)
@@ -246,9 +248,9 @@ def closeness(checker: CollisionChecker, q: Configuration) -> str:
     exact = _loaded("collision.exact_meshes").ExactCollision(checker.robot, checker.scene)
     check = [frozenset(check) for check in exact.checks].index(frozenset((link, partner)))
     [distance], [obstacle] = exact.nearest(q[None], np.array([check]), np.array([np.inf]))
-    spheres = str(obstacle) if partner is None else f"those of {partner}"
+    hit = str(obstacle) if partner is None else f"those of {partner}"
     return (
-        f"the covering spheres of {link} reach {-1e3 * float(clearances[deepest]):.1f} mm into {spheres}, "
+        f"the covering spheres of {link} reach {-1e3 * float(clearances[deepest]):.1f} mm into {hit}, "
         f"though the meshes are {1e3 * float(distance):.1f} mm apart"
     )
 
@@ -416,7 +418,7 @@ def _pose_goals(
                 )
                 break
     # Exact meshes may be free where the covering spheres collide. Distinct rejected configurations are
-    # checked, nearest to the start first, if they are nearer to it than the best free one.
+    # checked, nearest to the start first, if they are nearer to it than the nearest free one.
     rejected = rejected[np.unique(np.round(rejected, 1), axis=0, return_index=True)[1]]
     rejected = rejected[np.argsort(distances(rejected), kind="stable")][:MAX_EXACT_GOALS]
     if len(configurations):
@@ -450,7 +452,7 @@ def _pose_goals(
     collision = _explained(robot, scene, rejected[0])
     return context.fail(
         Status.INVALID_GOAL,
-        f"all {len(rejected)} configurations found for {of_poses} are in collision, e.g. {collision}",
+        f"all {len(rejected)} configurations checked for {of_poses} are in collision, e.g. {collision}",
     )
 
 
@@ -462,7 +464,7 @@ def _loaded(name: str) -> ModuleType:
 
 
 def _with_turns(context: PlanningContext, goals: Iterable[ndarray]) -> Configurations:
-    """The goals and their copies with whole turns added to continuous joints, which reach the same pose."""
+    """The goals, and copies with whole turns of the joints whose limits allow more than a turn."""
     robot = context.problem.robot
     start = context.problem.start
     return np.concatenate([robot.equivalent_configurations(q, start) for q in goals])

@@ -170,7 +170,7 @@ class AnytimeSearch:
         self.settings = settings
         self.name = name
         self.bounded = bounded
-        self.start, self.goals = start_goal.rows()
+        self.start, self.goals = start_goal.leads()
         self.best: Configurations | None = None
         """The path of the lowest cost so far, free at the resolution of the search."""
         self.length = np.float32(np.inf)

@@ -432,7 +432,7 @@ class SharedTreeRRTStar(Planner[SharedTreeSettings]):
         """See `planning.planner.Planner`."""
         for settings, attempt in ever_finer(context, self.settings):
             state = random_state(context.request.seed, attempt)
-            search = SharedTreeSearch(start_goal.checker, *start_goal.rows(), settings, state)
+            search = SharedTreeSearch(start_goal.checker, *start_goal.leads(), settings, state)
 
             def out_of_time(search: SharedTreeSearch = search) -> bool:
                 if search.cost < np.inf:

@@ -1,9 +1,9 @@
 """The server of a page: viser with access control, lights, a floor and a first view.
 
 viser by itself accepts every connection. This server checks each browser before it sends data of the session.
-If there is a token, the address that the browser connects to must end with it. Without a token, the address
-must name this machine, which prevents DNS rebinding. Pages of other origins are refused. Viser's own web page
-(HTML and JavaScript) is served without a check.
+If there is a token, it must be the path of the address that the browser connects to. Without a token, the
+address must name this machine, which prevents DNS rebinding. Pages of other origins are refused. Viser's own
+web page (HTML and JavaScript) is served without a check.
 """
 
 import hmac
