@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -138,6 +139,13 @@ def test_bad_input() -> None:
         (lambda made: rd.Workspace(made.robot, "nose"), "unknown link 'nose'"),
     ):
         refuses(message, call, planner())
+
+
+def test_xacro_is_not_compiled(tmp_path: Path) -> None:
+    file = tmp_path / "arm.urdf.xacro"
+    file.write_text("<robot name='arm'><link name='base'/></robot>")
+    with pytest.raises(rd.InputError, match="is a xacro file, and compiling it would run code in it"):
+        Planner(file, "base")
 
 
 def test_a_moved_base_keeps_obstacles_held_objects_and_allowed_contacts(made: Planner) -> None:

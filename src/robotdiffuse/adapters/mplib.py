@@ -30,6 +30,7 @@ from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.bodies import RigidShape
 from robotdiffuse.robots.fitting.preparation import add_robot
+from robotdiffuse.robots.parsing.urdf import UrdfTree
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import ROBOT_FILE, user_robots
 from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Sphere
@@ -333,7 +334,7 @@ class Planner:
         return q[self._places]
 
     def _qpos(self, q: ndarray, start_qpos: ArrayLike) -> ndarray:
-        """A configuration of the planned joints as a `qpos`; the other joints are as in `start_qpos`."""
+        """`q` as a `qpos`; other joints as in `start_qpos`."""
         qpos = np.ravel(np.array(start_qpos, float))
         if len(qpos) == len(q):
             return q
@@ -346,7 +347,6 @@ class Planner:
 
 
 def _reasons(workspace: Workspace, q: ndarray) -> list[str]:
-    """The reason why a configuration is refused, in a list; empty if it is free."""
     state = workspace.is_free(q)
     return [] if state else [state.reason]
 
@@ -379,6 +379,7 @@ def _robot(urdf: str | Path, tip: str, srdf: str | Path, package: str) -> Robot:
         if not Path(package).is_dir():
             raise InputError(f"package_keyword_replacement is {shown(package)}; it must be a folder")
         packages = {entry.name: entry for entry in Path(package).iterdir() if entry.is_dir()}
+    UrdfTree(Path(urdf), packages)  # refuses xacro, which can run code
     return add_robot(urdf, tip=tip, srdf=srdf or None, packages=packages, out=folder).robot
 
 
@@ -401,6 +402,6 @@ def _limited(robot: Robot, velocity: ArrayLike, acceleration: ArrayLike) -> Robo
 
 
 def _array(value: object) -> ndarray:
-    """The value as an array of numbers; empty if it is none."""
+    """The value as numbers; empty if it is none."""
     array = numbers(value)
     return np.zeros(0) if array is None else array
