@@ -15,7 +15,7 @@ from robotdiffuse.certificates.checker import Findings, check
 from robotdiffuse.certificates.proof import DECIMALS, MotionProof, StretchProof, Tolerances, joined
 from robotdiffuse.core.bounds import MAX_RATE, numbers, one_line, within
 from robotdiffuse.core.errors import InputError, reading, shown
-from robotdiffuse.core.input_files import check_ending, read_json
+from robotdiffuse.core.input_files import known_ending, read_json
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.settings import Number, converted
 from robotdiffuse.core.types import Path, Trajectory, check_motion_arrays
@@ -83,7 +83,7 @@ def load_certificate(file: str | FilePath) -> Certificate:
         >>> rd.load_certificate("proof.json").check(problem).valid
         True
     """
-    check_ending(file, "certificate", (".json",))
+    known_ending(file, "certificate", (".json",))
     record = read_json(file)
     if not is_certificate(record):
         raise InputError(f"{file} is not a certificate; write one by `robotdiffuse verify --certificate`")

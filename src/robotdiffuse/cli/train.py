@@ -100,9 +100,7 @@ def run_planner(arguments: Namespace) -> None:
         options["encoder"] = str(Path(arguments.out) / "encoder")
     settings = planner_training(arguments.config, options)
     folder = Path(arguments.out)
-    new = bundled and not (folder / "encoder").exists()
-    if bundled:
-        copy_bundled_encoder(folder / "encoder")
+    new = bundled and copy_bundled_encoder(folder / "encoder")
     try:
         report = train_planner(settings, arguments.out)
     except InputError:
@@ -232,10 +230,11 @@ def _check_disk(work: Path, motions: int) -> None:
         )
 
 
-def copy_bundled_encoder(folder: Path) -> Path:
-    """Save the encoder of the bundled weights in the form that the training reads; returns the folder."""
+def copy_bundled_encoder(folder: Path) -> bool:
+    """Save the encoder of the bundled weights in the form that the training reads, unless it was saved
+    before; returns whether it is new."""
     if (folder / "encoder.json").is_file():
-        return folder
+        return False
     encoder = load_network("model", BUNDLED / "panda", load_robot("panda")).encoder
     save_network("encoder", encoder, folder, {"from": "the weights that come with the package for panda"})
-    return folder
+    return True

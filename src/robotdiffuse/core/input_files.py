@@ -22,7 +22,7 @@ import numpy as np
 import yaml
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, check_type, reading, repeated, shortened, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, check_type, reading, repeated, shortened, shown
 
 MEGABYTE = 2**20
 MAX_FILE_SIZE = 256 * MEGABYTE
@@ -68,11 +68,11 @@ def file_name(file: object, what: str = "file") -> Path:
     return path
 
 
-def check_ending(file: str | Path, what: str, endings: Collection[str]) -> None:
-    """Raises InputError, naming `what`, unless the file name has one of the endings."""
+def known_ending(file: str | Path, what: str, endings: Collection[str]) -> str:
+    """The file's ending in lower case. Raises InputError, naming `what`, unless it is one of `endings`."""
     ending = file_name(file, what).suffix.lower()
-    if ending not in endings:
-        raise unknown_name(f"{what} format of {file}:", ending, endings)
+    check_name(f"{what} format of {file}:", ending, endings)
+    return ending
 
 
 def is_file(file: str | Path) -> bool:

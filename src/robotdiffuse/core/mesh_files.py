@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, reading, shown, unknown_name
+from robotdiffuse.core.errors import InputError, reading, shown
 from robotdiffuse.core.input_files import (
     MAX_DEPTH,
     MAX_FILE_SIZE,
     input_file,
+    known_ending,
     parse_json,
     parse_xml,
     read_bytes,
@@ -66,9 +67,7 @@ def read_triangles(
         InputError: For files that `input_file` refuses, other formats, and empty or damaged files.
     """
     path = input_file(file, "mesh file")
-    ending = path.suffix.lower()
-    if ending not in MESH_FORMATS:
-        raise unknown_name(f"mesh format of {file}:", path.suffix, MESH_FORMATS)
+    ending = known_ending(path, "mesh", MESH_FORMATS)
     content = read_bytes(path, "mesh file")
     if not content:
         raise InputError(f"mesh file {file} is empty")

@@ -140,10 +140,7 @@ class JsonLines:
     def append(self, row: dict[str, Any]) -> None:
         """Add a row and flush it to the disk. If writing fails, the row is in neither the file nor `rows`."""
         if self._file is not None:
-            try:
-                self._write(self._file, json.dumps(row) + "\n")
-            except OSError as error:
-                raise write_error(self._file, error) from None
+            self._write(self._file, json.dumps(row) + "\n")
         self.rows.append(row)
 
     def _write(self, file: Path, line: str) -> None:
@@ -151,17 +148,20 @@ class JsonLines:
             # The incomplete line is removed only now: at reading, another process could still be writing it.
             write_atomically(file, self._without_cut_line)
             self._without_cut_line = None
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with file.open("ab", buffering=0) as stream:
-            size = stream.seek(0, os.SEEK_END)
-            unwritten = memoryview(line.encode())
-            try:
-                while unwritten:
-                    unwritten = unwritten[stream.write(unwritten) :]
-                os.fsync(stream.fileno())
-            except BaseException:
-                stream.truncate(size)
-                raise
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with file.open("ab", buffering=0) as stream:
+                size = stream.seek(0, os.SEEK_END)
+                unwritten = memoryview(line.encode())
+                try:
+                    while unwritten:
+                        unwritten = unwritten[stream.write(unwritten) :]
+                    os.fsync(stream.fileno())
+                except BaseException:
+                    stream.truncate(size)
+                    raise
+        except OSError as error:
+            raise write_error(file, error) from None
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from types import NoneType
 from typing import Any
 
 from robotdiffuse.core.errors import InputError, check_type, located, shown
-from robotdiffuse.core.input_files import check_ending, read_json
+from robotdiffuse.core.input_files import known_ending, read_json
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.settings import Natural, Number, converted
 from robotdiffuse.core.types import (
@@ -207,7 +207,7 @@ def load_result(file: str | FilePath) -> ResultFile:
     planned = f"it is a problem; `robotdiffuse plan {file} --out result.json` makes a result of it"
     if FilePath(str(file)).suffix.lower() in PROBLEM_ENDINGS:
         raise InputError(f"{file} is not a result file: {planned}")
-    check_ending(file, "result file", (".json",))
+    known_ending(file, "result file", (".json",))
     record = read_json(file)
     if not isinstance(record, dict):
         raise InputError(f"{file} is not a result file: it must hold one JSON object")

@@ -21,7 +21,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.core.errors import InputError, check_name, unknown_name
+from robotdiffuse.core.errors import InputError, check_name
 from robotdiffuse.core.interrupts import delay_interrupts
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.registry import Entry, Registry
@@ -280,8 +280,8 @@ def generate(
     """
     if workers < 1:
         raise InputError(f"workers is {workers}; it must be at least 1")
-    if cluster is not None and cluster not in CLUSTERS:
-        raise unknown_name("cluster", cluster, CLUSTERS)
+    if cluster is not None:
+        check_name("cluster", cluster, CLUSTERS)
     manifest = manifest_of(settings)
     with lock_folder(out):
         try:

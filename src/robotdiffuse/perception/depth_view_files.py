@@ -20,8 +20,15 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import numbers, positive, unit_quaternion, vector
-from robotdiffuse.core.errors import InputError, located, needs, reading, shown, unknown_name
-from robotdiffuse.core.input_files import input_file, read_array, read_arrays, read_json, read_yaml
+from robotdiffuse.core.errors import InputError, located, needs, reading, shown
+from robotdiffuse.core.input_files import (
+    input_file,
+    known_ending,
+    read_array,
+    read_arrays,
+    read_json,
+    read_yaml,
+)
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.perception.depth_view import INTEGER_NO_RETURN, INTRINSICS, DepthNoise, DepthView
 from robotdiffuse.scenes.files import check_fields, name_from
@@ -42,9 +49,7 @@ def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "
     0, "no return". Raises InputError for a file that is missing or is not a depth image.
     """
     file = Path(file)
-    read = _READERS.get(file.suffix.lower())
-    if read is None:
-        raise unknown_name(f"depth image format of {file}:", file.suffix, _READERS)
+    read = _READERS[known_ending(file, "depth image", _READERS)]
     input_file(file, "depth image")
     with reading(f"depth image {file}"):
         image = read(file)

@@ -12,10 +12,10 @@ from typing import Any
 
 import yaml
 
-from robotdiffuse.core.errors import InputError, check_type, located, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, check_type, located, shown
 from robotdiffuse.core.input_files import (
-    check_ending,
     file_name,
+    known_ending,
     no_files,
     parse_json,
     parse_yaml,
@@ -90,7 +90,7 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
     check_type("index", index, Integral, "a whole number from 0 on")
     if file.is_dir():
         raise InputError(f"{file} is a folder; give a file in it, or the folder to `robotdiffuse bench run`")
-    check_ending(file, "problem file", WRITERS)
+    known_ending(file, "problem file", WRITERS)
     text = read_text(file)
     if file.suffix.lower() == ".jsonl":
         lines = _lines(text)
@@ -193,8 +193,7 @@ def save_problem(problem: Problem, file: str | Path, robot: str | None = None) -
     `robot` as in `problem_record`. Raises InputError if the file cannot be written.
     """
     file = file_name(file, "problem file")
-    ending = file.suffix.lower()
-    check_ending(file, "problem file", WRITERS)
+    ending = known_ending(file, "problem file", WRITERS)
     text = WRITERS[ending](problem_record(problem, file.parent, robot))
     if ending != ".jsonl":
         write_atomically(file, text)
@@ -344,8 +343,8 @@ def _problem(
 
 
 def _robot(name: object, locked: object, folder: Path, robots: Mapping[str, Robot] | None = None) -> Robot:
-    if robots is not None and (not isinstance(name, str) or name not in robots):
-        raise unknown_name("robot", name, robots)
+    if robots is not None:
+        check_name("robot", name, robots)
     if not isinstance(name, str) or not name:
         raise InputError(
             f"robot is {shown(name)}; it must be a bundled name ({', '.join(ROBOTS)}) or a URDF file"

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import unit_quaternion, vector
-from robotdiffuse.core.errors import InputError, joined, located, shortened, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, joined, located, shortened, shown, unknown_name
 from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import (
@@ -310,8 +310,7 @@ def object_shapes(entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> 
                 continue
             kind = part.get("type")
             kind = TYPE_NUMBERS.get(kind, kind) if isinstance(kind, int) else kind
-            if not isinstance(kind, str) or kind not in PRIMITIVES:
-                raise unknown_name(f"type of {location}:", kind, PRIMITIVES)
+            check_name(f"type of {location}:", kind, PRIMITIVES)
             count, build = PRIMITIVES[kind]
             shapes.append(build(vector(location, "dimensions", part.get("dimensions"), count), *placed))
     return shapes

@@ -23,7 +23,6 @@ from robotdiffuse.core.errors import (
     check_type,
     distinct,
     shown,
-    unknown_name,
 )
 from robotdiffuse.core.transforms import inverse
 from robotdiffuse.core.types import AnyConfiguration, Configuration, JointValues, Pose, Values
@@ -106,11 +105,9 @@ def blend_radii(value: object, count: int) -> tuple[float, ...]:
 
 def check_contacts(robot: Robot, scene: Scene) -> None:
     """Raises InputError for allowed contacts of links that the robot lacks."""
-    link_names = {*robot.link_names}
     for obstacle, links in scene.allowed_contacts:
         for link in () if links == ALL_LINKS else links:
-            if link not in link_names:
-                raise unknown_name(f"link in allowed_contacts of {obstacle}:", link, robot.link_names)
+            check_name(f"link in allowed_contacts of {obstacle}:", link, robot.link_names)
 
 
 def moving_obstacles(moving: Any, scene: Scene) -> tuple[MovingObstacle, ...]:
@@ -551,9 +548,8 @@ def check_clearance(value: object) -> float:
 
 def check_unknown(field: str, value: object) -> str:
     """The value, if it is one of UNKNOWN_POLICIES. Raises InputError for anything else."""
-    if not isinstance(value, str) or value not in UNKNOWN_POLICIES:
-        raise unknown_name(f"policy in {field}:", str(value), UNKNOWN_POLICIES)
-    return value
+    check_name(f"policy in {field}:", value, UNKNOWN_POLICIES)
+    return str(value)
 
 
 def _check_combinations(checked: dict[str, Any]) -> None:

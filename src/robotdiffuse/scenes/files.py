@@ -9,8 +9,8 @@ from typing import Any
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import MAX_RPY, vector
-from robotdiffuse.core.errors import InputError, check_name, located, shown, unknown_name
-from robotdiffuse.core.input_files import read_array
+from robotdiffuse.core.errors import InputError, check_name, located, shown
+from robotdiffuse.core.input_files import known_ending, read_array
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
 from robotdiffuse.scenes.point_cloud import default_radius, read_points
@@ -136,8 +136,7 @@ def _content(kind: type[Shape], file: str, notes: list[str]) -> tuple[ndarray, .
     if kind is Mesh:
         return read_triangles(file, notes=notes)
     if kind is HeightMap:
-        if Path(file).suffix.lower() not in (".npy", ".npz"):
-            raise unknown_name(f"height map format of {file}:", Path(file).suffix, (".npy", ".npz"))
+        known_ending(file, "height map", (".npy", ".npz"))
         return (read_array(file, "heights"),)
     points, new_notes = read_points(file)
     notes.extend(new_notes)

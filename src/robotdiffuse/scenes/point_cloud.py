@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, reading, shown, unknown_name
-from robotdiffuse.core.input_files import input_file, read_array, read_bytes
+from robotdiffuse.core.errors import InputError, reading, shown
+from robotdiffuse.core.input_files import input_file, known_ending, read_array, read_bytes
 from robotdiffuse.core.mesh_files import check_ply
 from robotdiffuse.core.types import Points, Vector
 
@@ -167,9 +167,7 @@ def read_points(file: str | Path) -> tuple[Points, tuple[str, ...]]:
     cloud.
     """
     file = Path(file)
-    reader = READERS.get(file.suffix.lower())
-    if reader is None:
-        raise unknown_name(f"point cloud format of {file}:", file.suffix, READERS)
+    reader = READERS[known_ending(file, "point cloud", READERS)]
     if input_file(file, "point cloud file").stat().st_size == 0:
         raise InputError(f"point cloud file {file} is empty")
     with reading(f"point cloud file {file}"):
