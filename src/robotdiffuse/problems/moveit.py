@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import unit_quaternion, vector
+from robotdiffuse.core.bounds import numbers, unit_quaternion, vector
 from robotdiffuse.core.errors import InputError, check_name, joined, located, shortened, shown, unknown_name
 from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.core.mesh_files import read_triangles
@@ -53,6 +53,10 @@ PLANE_EXTENT = 20.0
 PLANE_THICKNESS = 0.01
 MAX_PLANES = 1000
 """Maximum number of planes in a collision object; each becomes a box."""
+WIDE_REGION = 0.02
+"""A dimension of a goal region above this, twice the validator's tolerance, is noted [m]."""
+WIDE_ANGLE = 0.2618
+"""A tolerance of a goal orientation above this, the validator's tolerance, is noted [rad]."""
 NO_POSE = {"position": [0, 0, 0], "orientation": [0, 0, 0, 1]}
 TYPE_NUMBERS = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone", 5: "prism"}
 """Names of the types of shape_msgs/SolidPrimitive, by their numbers in messages."""
@@ -311,7 +315,7 @@ def object_shapes(entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> 
             kind = part.get("type")
             kind = TYPE_NUMBERS.get(kind, kind) if isinstance(kind, int) else kind
             check_name(f"type of {location}:", kind, PRIMITIVES)
-            count, build = PRIMITIVES[kind]
+            count, build = PRIMITIVES[str(kind)]
             shapes.append(build(vector(location, "dimensions", part.get("dimensions"), count), *placed))
     return shapes
 
@@ -474,7 +478,8 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
     frames: the frames of the request's scene. folder: names of mesh files are relative to it.
 
     Several joint goal constraints are alternative goals. A position and an orientation constraint of one link
-    are a pose goal at the center of the position's region; sizes and tolerances are ignored. Raises
+    are a pose goal at the center of the position's region; sizes and tolerances are ignored, with a note if
+    they are large. Raises
     InputError for anything else, and for path constraints, because ignoring them would change the problem.
     """
     data = mapping_of(REQUEST, data)
@@ -512,6 +517,9 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
     pose_goal = None
     if len(goals) == 1 and goals[0][1].get("position_constraints"):
         pose_goal = _pose_goal(*goals[0], frames)
+        wide = _wide_tolerances(goals[0][1])
+        if wide:
+            notes.append(f"goal_constraints[0]: its {joined(wide)} are ignored: the goal is the pose itself")
     else:
         joint_goals = tuple(_joint_goal(*goal) for goal in goals)
     return MoveItRequest(start, joint_goals, pose_goal, attached, tuple(notes))
@@ -536,6 +544,24 @@ def _joint_goal(where: str, goal: dict[str, Any]) -> dict[str, float]:
         str(entry.get("joint_name")): float(vector(at, "position", [entry.get("position")], 1)[0])
         for at, entry in mappings_of(f"{where}.", goal, "joint_constraints")
     }
+
+
+def _wide_tolerances(goal: dict[str, Any]) -> list[str]:
+    """The tolerances of a pose goal that permit much more than the validator does."""
+    [(at, position)], [(_, orientation)] = (
+        mappings_of("", goal, f"{kind}_constraints") for kind in ("position", "orientation")
+    )
+    region = mapping_of(at, position, "constraint_region")
+    shapes = mappings_of("", region, "primitives")
+    sizes = [size for _, shape in shapes for size in list_of("", shape, "dimensions")]
+    angles = [orientation.get(f"absolute_{axis}_axis_tolerance", 0) for axis in "xyz"]
+    limits = ((sizes, WIDE_REGION, "region", "m"), (angles, WIDE_ANGLE, "tolerance", "rad"))
+    wide = []
+    for values, limit, name, unit in limits:
+        array = numbers(values)
+        if array is not None and array.max(initial=0) > limit:
+            wide.append(f"{name} of {array.max():g} {unit}")
+    return wide
 
 
 def _pose_goal(where: str, goal: dict[str, Any], frames: MoveItFrames) -> tuple[str, ndarray]:

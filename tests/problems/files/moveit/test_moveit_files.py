@@ -346,6 +346,18 @@ def test_pose_goal(tmp_path: Path) -> None:
     np.testing.assert_allclose(T[:3, :3], flipped, atol=1e-12)
 
 
+def test_wide_tolerances_of_a_pose_goal_are_noted() -> None:
+    goal = pose_constraint()
+    data = request_data() | {"goal_constraints": [goal]}
+    region = goal["position_constraints"][0]["constraint_region"]
+    region["primitives"] = [{"type": "sphere", "dimensions": [0.001]}]
+    assert not moveit_request(data, moveit_frames({}, PANDA)).notes
+    region["primitives"] = [{"type": "sphere", "dimensions": [0.1]}]
+    goal["orientation_constraints"][0]["absolute_z_axis_tolerance"] = 3.1
+    [note] = moveit_request(data, moveit_frames({}, PANDA)).notes
+    assert "region of 0.1 m, tolerance of 3.1 rad are ignored" in note
+
+
 @pytest.mark.parametrize("frame", ["panda_hand", "world"])
 def test_objects_are_held_at_the_start(frame: str, tmp_path: Path) -> None:
     bare = asked(tmp_path, request_data()).load()
