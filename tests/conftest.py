@@ -23,8 +23,7 @@ COMPILED = re.compile(rf"^\s*(import numba\b|from numba\b|from {_KERNELS} import
 
 
 def checked_modules() -> list[str]:
-    """All modules without compiled functions. Packages are left out, since the name of a package covers all
-    modules below it."""
+    """All modules without compiled functions, and no packages, whose names cover all modules below them."""
     return [
         ".".join(file.relative_to(SOURCE.parent).with_suffix("").parts)
         for file in sorted(SOURCE.rglob("*.py"))

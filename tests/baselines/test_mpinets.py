@@ -36,8 +36,7 @@ class Straight(mpinets.MPiNetsNetwork):
 
 
 def line_data(walls: bool) -> TrajectoryData:
-    rng = np.random.default_rng(3)
-    ends = np.stack([LEFT, RIGHT])[[[0, 1], [1, 0]] * 4] + rng.uniform(-0.05, 0.05, (8, 2, 7))
+    ends = np.stack([LEFT, RIGHT])[[[0, 1], [1, 0]] * 4] + np.random.default_rng(3).uniform(-0.05, 0.05, (8, 2, 7))
     share = np.linspace(0, 1, 24)[:, None]
     q = (ends[:, :1] * (1 - share) + ends[:, 1:] * share).astype(np.float32)
     kinds = np.full((8, 1), BOX if walls else 0, np.int8)

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from helpers.panda import LEFT, PANDA, RIGHT
+from helpers.refusals import refuses
 from helpers.trainings import trained
-from robotdiffuse import Box, InputError, JointGoal, Problem, Scene, verify
+from robotdiffuse import Box, JointGoal, Problem, Scene, verify
 from robotdiffuse.baselines.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.datasets.rows import resample
@@ -167,5 +168,4 @@ def test_hybrid_replanning_joins_what_the_network_does_not(weights: str) -> None
 
 @pytest.mark.parametrize(("name", "value"), [("layers", ()), ("steady_layers", 12)])
 def test_bad_settings_of_the_network_are_refused(name: str, value: object) -> None:
-    with pytest.raises(InputError, match=f"mpnet.{name} is "):
-        replace(MPNetSettings(), **{name: value})
+    refuses(f"mpnet.{name} is ", replace, MPNetSettings(), **{name: value})

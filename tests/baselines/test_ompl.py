@@ -56,8 +56,7 @@ def test_a_goal_where_the_arm_stands_and_an_end_when_no_path_can_be_shorter(plan
 @pytest.mark.timeout(300)
 def test_prm_with_many_goals_ends():
     """Regression: the two threads of OMPL's PRM deadlocked on the locks of its roadmap and of Python."""
-    rng = np.random.default_rng(0)
-    many = problem(*(RIGHT + 0.1 * rng.standard_normal((20, 7))))
+    many = problem(*(RIGHT + 0.1 * np.random.default_rng(0).standard_normal((20, 7))))
     for seed in range(5):
         result = ompl.OmplPRM().plan(many, time_limit=120.0, seed=seed)
         assert result.path is not None and rd.verify(many, result.path).valid

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.example_robots import example_robot
+from helpers.panda import PANDA
 from helpers.refusals import refuses
 from robotdiffuse.certificates import bounds as proofs
 from robotdiffuse.certificates.kinematics import Linkage
@@ -42,8 +43,7 @@ ROBOTS = {"panda": lambda: rd.load_robot("panda"), "box arm": box_arm, "two arms
 @pytest.mark.parametrize("name", ROBOTS)
 def test_links_are_where_the_validator_has_them(name: str) -> None:
     robot = ROBOTS[name]()
-    rng = np.random.default_rng(0)
-    q = rng.uniform(robot.lower, robot.upper, (5, robot.dof))
+    q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (5, robot.dof))
     linkage = Linkage(robot)
     T = linkage.place(q).T
     for k, link in enumerate(linkage.links):
@@ -63,8 +63,7 @@ def _triangle(corners: np.ndarray) -> coal.Convex:
 
 
 def test_distances_are_those_of_coal() -> None:
-    rng = np.random.default_rng(1)
-    points = rng.uniform(-1, 1, (60, 3))
+    points = np.random.default_rng(1).uniform(-1, 1, (60, 3))
     obstacles = proofs.Obstacles(rd.Scene(shapes()))
     found = obstacles.distances(points)
     for k, body in enumerate(obstacles.bodies):
@@ -114,13 +113,11 @@ def test_reach_is_the_greatest_of_points_on_the_surface() -> None:
 
 @given(st.integers(0, 10_000))
 def test_nothing_moves_further_than_its_displacement(seed: int) -> None:
-    """Random configurations within the spans of joint values: every sphere, and every pair of links in the
-    frame of the link nearer to the base."""
+    """Every sphere, and every pair of links in the frame of the link nearer to the base."""
     rng = np.random.default_rng(seed)
-    robot = rd.load_robot("panda")
-    ends = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
+    ends = rng.uniform(PANDA.lower, PANDA.upper, (2, PANDA.dof))
     ends[1] = ends[0] + (ends[1] - ends[0]) * rng.uniform(0, 0.5)
-    prover = proofs.Prover(robot, rd.Scene(), ends, np.zeros_like(ends[1:]))
+    prover = proofs.Prover(PANDA, rd.Scene(), ends, np.zeros_like(ends[1:]))
     claims = np.arange(len(prover.claims))
     ones = np.ones(len(prover.claims))
     bounds = prover.bounds(proofs.Stretches(claims, 0 * ones, ones), ones < 0, [])
@@ -131,7 +128,7 @@ def test_nothing_moves_further_than_its_displacement(seed: int) -> None:
         link = linkage.links.index(claim.link)
         base = 0 if claim.against == proofs.SCENE else linkage.links.index(claim.against)
         seen = np.linalg.inv(places[:, base]) @ places[:, link]
-        centers = robot.spheres[claim.link][:, :3] @ np.swapaxes(seen[:, :3, :3], 1, 2) + seen[:, None, :3, 3]
+        centers = PANDA.spheres[claim.link][:, :3] @ np.swapaxes(seen[:, :3, :3], 1, 2) + seen[:, None, :3, 3]
         # a point of a ball goes at least as far as its center, at most by the turning of its radius more
         assert np.linalg.norm(centers[1:] - centers[0], axis=-1).max() <= displacement + 1e-12
 
@@ -140,18 +137,17 @@ def test_nothing_moves_further_than_its_displacement(seed: int) -> None:
 def test_no_point_goes_further_against_a_normal_than_its_approach(seed: int) -> None:
     """Vertices of the hand along a bent path, in the frames of the base and of a link between base and hand."""
     rng = np.random.default_rng(seed)
-    robot = rd.load_robot("panda")
-    linkage = Linkage(robot)
+    linkage = Linkage(PANDA)
     link = "panda_hand"
-    middle = rng.uniform(robot.lower, robot.upper)
-    steps = rng.normal(0, 0.1, (4, robot.dof)) * rng.integers(0, 2, robot.dof)
+    middle = rng.uniform(PANDA.lower, PANDA.upper)
+    steps = rng.normal(0, 0.1, (4, PANDA.dof)) * rng.integers(0, 2, PANDA.dof)
     normals = rng.normal(size=(2, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     share = rng.uniform(0, 1, (40, 1))
     at = middle + np.concatenate([share * steps[0], steps[0] + share * (steps[1] - steps[0]), steps])
     places = linkage.place(np.concatenate([middle[None], at]))
     k = linkage.links.index(link)
-    [mesh, *_] = robot.meshes[link]
+    [mesh, *_] = PANDA.meshes[link]
     for base in (0, linkage.links.index("panda_link4")):
         # where the hand comes to stand, as seen from where the base stands in the middle
         T = places.T[0, base] @ np.linalg.inv(places.T[:, base]) @ places.T[:, k]
@@ -159,7 +155,7 @@ def test_no_point_goes_further_against_a_normal_than_its_approach(seed: int) -> 
         moved_by = np.flatnonzero(linkage.moved[k] & ~linkage.moved[base])
         origins = places.origins[0]
         axes = places.axes[0]
-        bound = linkage.approach(origins, axes, points[0], moved_by, steps, normals, np.zeros(robot.dof))
+        bound = linkage.approach(origins, axes, points[0], moved_by, steps, normals, np.zeros(PANDA.dof))
         went = (points[0] - points) @ normals.T
         assert (bound + 1e-12 >= went.max(axis=0).T).all()
 

@@ -108,8 +108,7 @@ def test_short_steps_hide_no_rate_from_the_checker(name: str, monkeypatch: pytes
 
 @pytest.mark.parametrize("with_times", [False, True])
 def test_an_empty_proof_of_one_row_is_none(with_times: bool) -> None:
-    """Start and goal are inside a box. A motion of one row has no intervals that stretches could miss, so an
-    empty proof must be refused too."""
+    """Start and goal are inside a box; a motion of one row has no intervals that stretches could miss."""
     robot = box_arm()
     here = np.zeros((1, 3))
     problem = rd.Problem(robot, rd.Scene([rd.Box([0.3, 0, 0], [2, 2, 2])]), here[0], rd.JointGoal(here))

@@ -13,6 +13,7 @@ import pytest
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.changes import later
+from helpers.panda import PANDA
 from robotdiffuse.certificates.proof import hash_of, request_parts, scene_parts
 from robotdiffuse.certificates.requirements import not_checked
 from robotdiffuse.cli.verify import described
@@ -30,20 +31,18 @@ Record = dict[str, Any]
 
 @pytest.fixture(scope="module")
 def true(tmp_path_factory: pytest.TempPathFactory) -> tuple[FilePath, rd.Problem]:
-    """A valid motion with a stop at a waypoint, close to a table, beside a moving ball, with a payload, an axis
-    cone and a speed limit."""
-    robot = rd.load_robot("panda")
+    """A valid motion with a stop, near a table, beside a moving ball, with a payload, an axis cone and a speed limit."""
     table = rd.Box([0.5, 0.0, 0.194], [0.6, 1.6, 0.1], name="table")
     ball = rd.MovingObstacle(rd.Sphere([0.5, 1.4, 0.5], 0.1, "ball"), velocity=[0.0, -0.05, 0.0])
     cone = rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.5)
     asked = {"waypoints": [MIDDLE], "moving": [ball], "constraints": [cone], "payload": rd.Payload(1.0, [0.0, 0.0, 0.05], HAND)}
-    problem = rd.Problem(robot, rd.Scene([table]), START, GOAL, **asked)  # type: ignore[arg-type]
-    ends = rd.Path(robot.joint_names, np.array([START, MIDDLE]))
-    half = time_parameterize(robot, ends, lambda _: True, lambda _: True).trajectory
+    problem = rd.Problem(PANDA, rd.Scene([table]), START, GOAL, **asked)  # type: ignore[arg-type]
+    ends = rd.Path(PANDA.joint_names, np.array([START, MIDDLE]))
+    half = time_parameterize(PANDA, ends, lambda _: True, lambda _: True).trajectory
     positions = np.concatenate([half.positions, half.positions[1:] + np.subtract(GOAL, MIDDLE)])
     rates = [np.concatenate([of, of[1:]]) for of in (half.velocities, half.accelerations)]
     times = np.append(half.times, half.duration + half.times[1:])
-    certificate = rd.certify(problem, rd.Trajectory(robot.joint_names, times, positions, *rates))
+    certificate = rd.certify(problem, rd.Trajectory(PANDA.joint_names, times, positions, *rates))
     assert certificate.check(problem).differences == () and certificate.proof.planes
     file = tmp_path_factory.mktemp("certificates") / "true.json"
     certificate.save(file)
@@ -295,10 +294,9 @@ def test_another_robot_is_caught_and_named(true: tuple[FilePath, rd.Problem]) ->
 
 
 def test_thin_spheres_are_refused() -> None:
-    panda = rd.load_robot("panda")
-    thin = {link: spheres * [1, 1, 1, 0.5] for link, spheres in panda.spheres.items()}
-    problem = rd.Problem(replace(panda, spheres=thin), rd.Scene(), START, GOAL)
-    found = rd.certify(problem, rd.Path(panda.joint_names, np.array([START, GOAL]))).check(problem).differences
+    thin = {link: spheres * [1, 1, 1, 0.5] for link, spheres in PANDA.spheres.items()}
+    problem = rd.Problem(replace(PANDA, spheres=thin), rd.Scene(), START, GOAL)
+    found = rd.certify(problem, rd.Path(PANDA.joint_names, np.array([START, GOAL]))).check(problem).differences
     assert any(re.match("robot: the meshes of panda_link5 stick out of its spheres by 0.0", line) for line in found)
 
 
@@ -312,7 +310,6 @@ def test_the_robot_is_described() -> None:
 
 
 def test_what_is_not_checked_is_told(true: tuple[FilePath, rd.Problem]) -> None:
-    panda = rd.load_robot("panda")
-    problem = rd.Problem(panda, rd.Scene(), START, GOAL, start_velocity=[0.1, 0, 0, 0, 0, 0, 0])
-    assert "start_velocity" in not_checked(problem, rd.Path(panda.joint_names, np.array([START, GOAL])))
+    problem = rd.Problem(PANDA, rd.Scene(), START, GOAL, start_velocity=[0.1, 0, 0, 0, 0, 0, 0])
+    assert "start_velocity" in not_checked(problem, rd.Path(PANDA.joint_names, np.array([START, GOAL])))
     assert not_checked(true[1], rd.load_certificate(true[0]).motion) == ["sharp reversals"]

@@ -75,7 +75,6 @@ def test_bounds_of_constraints_are_bounds() -> None:
 
 def test_bounds_in_time_are_bounds() -> None:
     """At every time of a stretch, the distance of all spheres to a rotating box is at least clearance minus displacement."""
-    rng = np.random.default_rng(1)
     times = np.linspace(0.0, 1.0, 6)
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, :3, 3] = [[0.5, 0.5, 0.5], [0.5, 0.0, 0.6], [0.3, -0.4, 0.4]]
@@ -83,7 +82,7 @@ def test_bounds_in_time_are_bounds() -> None:
     poses[2, :3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
     bar = rd.MovingObstacle(rd.Box(poses[0, :3, 3], [0.4, 0.1, 0.1], name="bar"), times=[0, 0.4, 1], poses=poses)
     ways = (bar, ACROSS, rd.MovingObstacle(rd.Sphere([0.7, 0.3, 0.5], 0.1, "ball"), max_speed=0.0))
-    q = np.array(START) + 0.2 * rng.normal(size=(6, 7)).cumsum(axis=0)
+    q = np.array(START) + 0.2 * np.random.default_rng(1).normal(size=(6, 7)).cumsum(axis=0)
     prover = MovingProver(PANDA, ways, q, times, np.zeros_like(q[1:]))
     count = len(prover.claims)
     whole = Stretches(np.arange(count), np.full(count, 1.2), np.full(count, 1.9))

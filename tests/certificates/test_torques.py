@@ -38,8 +38,7 @@ def loaded(name: str) -> rd.Problem:
 @pytest.mark.parametrize("name", ROBOTS)
 def test_dynamics_are_pinocchios(name: str) -> None:
     problem = loaded(name)
-    rng = np.random.default_rng(0)
-    q, v, a = rng.normal(size=(3, 50, problem.robot.dof))
+    q, v, a = np.random.default_rng(0).normal(size=(3, 50, problem.robot.dof))
     expected = Dynamics(problem.robot, PAYLOAD, TURNED).torques(q, v, a)
     assert np.allclose(inverse_dynamics(problem, q, v, a), expected, atol=1e-9)
 

@@ -11,6 +11,7 @@ from numpy import ndarray
 import robotdiffuse as rd
 from helpers import sphere_oracles as oracles
 from helpers.box_arm import box_arm
+from helpers.panda import PANDA
 from helpers.refusals import refuses
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
@@ -40,8 +41,7 @@ def test_clearances_are_exact(name: str) -> None:
 
 
 def check_free(robot: rd.Robot, scene: rd.Scene, q: ndarray, padding: float = 0.0) -> None:
-    """Asserts that the check agrees with the sign of the oracles' smallest distances, and that both signs
-    occur."""
+    """Asserts that the check agrees with the sign of the oracles' smallest distances, and that both signs occur."""
     to_scene = oracles.link_distances(robot, scene, q).min(axis=1) - padding
     least = np.minimum(to_scene, oracles.pair_distances(robot, q).min(axis=1, initial=1))
     clear = np.abs(least) > oracles.TOLERANCE
@@ -59,14 +59,13 @@ def test_free_is_the_sign_of_the_clearance(name: str, padding: float) -> None:
 
 @given(kind=st.sampled_from(["sphere", "box", "cylinder", "capsule", "cloud"]), seed=st.integers(0, 2**32))
 def test_every_shape_at_any_pose(kind: str, seed: int) -> None:
-    robot = oracles.with_spheres("panda")
     rng = np.random.default_rng(seed)
     scene = rd.Scene([oracles.random_shape(kind, rng), oracles.random_shape(kind, rng)])
-    q = rng.uniform(robot.lower, robot.upper, (33, robot.dof))
-    checker = CollisionChecker(robot, scene)
-    right = oracles.link_distances(robot, scene, q)
+    q = rng.uniform(PANDA.lower, PANDA.upper, (33, PANDA.dof))
+    checker = CollisionChecker(PANDA, scene)
+    right = oracles.link_distances(PANDA, scene, q)
     found = checker.link_clearances(q)
-    hit = (right < 0).any(axis=1) | (oracles.pair_distances(robot, q) < 0).any(axis=1)
+    hit = (right < 0).any(axis=1) | (oracles.pair_distances(PANDA, q) < 0).any(axis=1)
     if kind == "cloud":
         # joined points reach further, by less than the diagonal of a thinning voxel
         radius = max(shape.point_radius for shape in scene.shapes if isinstance(shape, rd.PointCloud))
@@ -83,12 +82,11 @@ def test_every_shape_at_any_pose(kind: str, seed: int) -> None:
 @pytest.mark.parametrize("count", [15, 16, 17, 70])
 def test_any_number_of_obstacles(count: int) -> None:
     """Obstacles are processed in groups of sixteen."""
-    robot = oracles.with_spheres("panda")
     rng = np.random.default_rng(count)
     kinds = ("sphere", "box", "cylinder", "capsule")
     shapes = [oracles.random_shape(kinds[i % 4], rng) for i in range(count)]
     far = [shape for shape in shapes if np.linalg.norm(shape.center) > 0.6]  # type: ignore[attr-defined]
-    check_free(robot, rd.Scene(far), oracles.rows(robot, 600))
+    check_free(PANDA, rd.Scene(far), oracles.rows(PANDA, 600))
 
 
 @pytest.mark.parametrize("count", [16, 17, 50])
@@ -106,19 +104,17 @@ def test_links_with_any_number_of_spheres(count: int) -> None:
 
 def test_configurations_beyond_the_limits() -> None:
     """The tables of pairs of links do not cover these configurations, so the spheres decide."""
-    robot = oracles.with_spheres("panda")
-    q = np.random.default_rng(0).uniform(2 * robot.lower, 2 * robot.upper, (4000, robot.dof))
-    check_free(robot, rd.Scene(), q)
+    q = np.random.default_rng(0).uniform(2 * PANDA.lower, 2 * PANDA.upper, (4000, PANDA.dof))
+    check_free(PANDA, rd.Scene(), q)
 
 
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17])
 def test_any_number_of_configurations(count: int) -> None:
-    robot = oracles.with_spheres("panda")
-    checker = CollisionChecker(robot, oracles.solids())
-    q = oracles.rows(robot, 17)
+    checker = CollisionChecker(PANDA, oracles.solids())
+    q = oracles.rows(PANDA, 17)
     np.testing.assert_array_equal(checker.free(q[:count]), checker.free(q)[:count])
     np.testing.assert_array_equal(checker.link_clearances(q[:count]), checker.link_clearances(q)[:count])
-    assert checker.cost_gradients(q[:count], 0.05)[1].shape == (count, robot.dof)
+    assert checker.cost_gradients(q[:count], 0.05)[1].shape == (count, PANDA.dof)
 
 
 # -- against the exact meshes --------------------------------------------------------------------------------
@@ -126,24 +122,22 @@ def test_any_number_of_configurations(count: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_free_by_spheres_is_free_by_mesh(seed: int) -> None:
-    robot = oracles.with_spheres("panda")
     rng = np.random.default_rng(seed)
-    scene = (ROP if seed < 1 else ROP_DENSE).scene(rng, base_spheres(robot))
+    scene = (ROP if seed < 1 else ROP_DENSE).scene(rng, base_spheres(PANDA))
     shapes = [oracles.random_shape(kind, rng) for kind in ("cylinder", "capsule", "box", "cloud")]
     scene = rd.Scene([*scene.shapes, *shapes[: seed % 5]])
-    q = rng.uniform(robot.lower, robot.upper, (600, robot.dof))
-    free = CollisionChecker(robot, scene).free(q)
-    assert not ExactCollision(robot, scene).collides(q[free]).any()
+    q = rng.uniform(PANDA.lower, PANDA.upper, (600, PANDA.dof))
+    free = CollisionChecker(PANDA, scene).free(q)
+    assert not ExactCollision(PANDA, scene).collides(q[free]).any()
     # a cover that sticks out by a centimeter or two cannot refuse much more than this
-    assert (~free & ~ExactCollision(robot, scene).collides(q)).mean() < 0.1
+    assert (~free & ~ExactCollision(PANDA, scene).collides(q)).mean() < 0.1
 
 
 def test_locked_fingers_change_the_result() -> None:
-    robot = oracles.with_spheres("panda")
-    wide = robot.with_locked({"panda_finger_joint1": 0.065, "panda_finger_joint2": 0.065})
+    wide = PANDA.with_locked({"panda_finger_joint1": 0.065, "panda_finger_joint2": 0.065})
     scene = oracles.solids()
-    q = oracles.rows(robot, 5000)
-    one, other = (CollisionChecker(r, scene) for r in (robot, wide))
+    q = oracles.rows(PANDA, 5000)
+    one, other = (CollisionChecker(r, scene) for r in (PANDA, wide))
     np.testing.assert_allclose(
         other.link_clearances(q[:50]), oracles.link_distances(wide, scene, q[:50]), atol=oracles.TOLERANCE
     )
@@ -152,20 +146,18 @@ def test_locked_fingers_change_the_result() -> None:
 
 @pytest.mark.parametrize("size", [2.0, 1e3, 9.9e3])
 def test_a_huge_floor_is_as_exact_as_a_small_one(size: float) -> None:
-    robot = oracles.with_spheres("panda")
-    q = oracles.rows(robot, 400)
+    q = oracles.rows(PANDA, 400)
     scene = rd.Scene([rd.Box((0.3, 0.1, -size / 2 - 0.05), (size + 4, size + 4, size))])
-    lowest = [(c[..., 2] - r).min(axis=1) for c, r in zip(*oracles.sphere_centers(robot, q), strict=True)]
+    lowest = [(c[..., 2] - r).min(axis=1) for c, r in zip(*oracles.sphere_centers(PANDA, q), strict=True)]
     right = np.stack(lowest[1:], axis=1) + 0.05
-    found = CollisionChecker(robot, scene).link_clearances(q)
+    found = CollisionChecker(PANDA, scene).link_clearances(q)
     np.testing.assert_allclose(found, np.minimum(right, 1), atol=3e-5)
 
 
 def test_long_poles_keep_their_precision() -> None:
-    robot = oracles.with_spheres("panda")
-    q = oracles.rows(robot, 200)
+    q = oracles.rows(PANDA, 200)
     for make in (rd.Cylinder, rd.Capsule):
-        short, long = (CollisionChecker(robot, rd.Scene([make((0.4, 0.3, 0.2), 0.05, h)])) for h in (6.0, 1e4))
+        short, long = (CollisionChecker(PANDA, rd.Scene([make((0.4, 0.3, 0.2), 0.05, h)])) for h in (6.0, 1e4))
         np.testing.assert_allclose(long.link_clearances(q), short.link_clearances(q), atol=oracles.TOLERANCE)
 
 
@@ -198,13 +190,12 @@ def test_wrong_configurations_are_refused() -> None:
 
 
 def test_adding_an_obstacle_compiles_nothing() -> None:
-    robot = oracles.with_spheres("panda")
-    q = oracles.rows(robot, 20)
+    q = oracles.rows(PANDA, 20)
     compiled = []
     mesh = rd.Mesh(*oracles.box_triangles((0.2, 0.2, 0.2)))
     many = [shape for shape in oracles.solids().shapes for _ in range(3)]  # rows of several
     for shapes in ([], many, [*oracles.solids().shapes, rd.PointCloud([[0.5, 0.5, 0.5]]), mesh]):
-        checker = CollisionChecker(robot, rd.Scene(shapes))
+        checker = CollisionChecker(PANDA, rd.Scene(shapes))
         checker.free(q)
         oracles.least_clearance(checker, q)
         checker.cost_gradients(q, 0.05)

@@ -79,8 +79,7 @@ def test_degenerate_point_clouds(points: np.ndarray) -> None:
 
 
 def test_a_link_deep_in_a_point_cloud_and_an_empty_cloud() -> None:
-    """The depth is that of the deepest point, the middle of the box, which is nearer to the side than to the
-    top."""
+    """The depth is that of the deepest point, the middle of the box, which is nearer to the side than to the top."""
     points = np.stack([np.full(21, 0.25), np.linspace(-0.02, 0.02, 21), np.zeros(21)], axis=1)
     exact = ExactCollision(box_arm(), rd.Scene([rd.PointCloud(points, 0.01)]))
     assert exact.link_distances(Q0)[0].distance == pytest.approx(-HALF_WIDTH - 0.01, abs=1e-5)
@@ -130,9 +129,8 @@ def test_frames_agree_with_the_kinematics() -> None:
 
 def test_collides_is_the_sign_of_the_distance() -> None:
     robot = box_arm()
-    rng = np.random.default_rng(3)
     exact = ExactCollision(robot, solids())
-    q = rng.uniform(robot.lower, robot.upper, (200, 3))
+    q = np.random.default_rng(3).uniform(robot.lower, robot.upper, (200, 3))
     np.testing.assert_array_equal(exact.collides(q), [least(exact, row) <= 0 for row in q])
     assert exact.collides(np.zeros((0, 3))).shape == (0,)
 

@@ -9,6 +9,7 @@ from scipy.ndimage import distance_transform_edt
 import robotdiffuse as rd
 from helpers import sphere_oracles as oracles
 from helpers.box_arm import box_arm
+from helpers.panda import PANDA
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernels.nearest_voxels import nearest_voxels
@@ -17,12 +18,10 @@ from robotdiffuse.collision.point_cloud_grid import cover_triangles, thin_points
 
 def test_a_point_cloud_is_many_spheres() -> None:
     """The points are so far apart that thinning joins none of them."""
-    robot = oracles.with_spheres("panda")
-    rng = np.random.default_rng(0)
-    points = rng.uniform([-0.8, -0.8, 0.0], [0.8, 0.8, 1.2], (60, 3))
-    cloud = CollisionChecker(robot, rd.Scene([rd.PointCloud(points, 0.02)]))
-    spheres = CollisionChecker(robot, rd.Scene([rd.Sphere(point, 0.02) for point in points]))
-    q = oracles.rows(robot, 3000)
+    points = np.random.default_rng(0).uniform([-0.8, -0.8, 0.0], [0.8, 0.8, 1.2], (60, 3))
+    cloud = CollisionChecker(PANDA, rd.Scene([rd.PointCloud(points, 0.02)]))
+    spheres = CollisionChecker(PANDA, rd.Scene([rd.Sphere(point, 0.02) for point in points]))
+    q = oracles.rows(PANDA, 3000)
     np.testing.assert_array_equal(cloud.free(q), spheres.free(q))
     assert 0.05 < cloud.free(q).mean() < 0.95
     found = cloud.link_clearances(q)
@@ -37,8 +36,7 @@ def test_a_point_cloud_is_many_spheres() -> None:
 def test_the_nearest_of_a_dense_cloud() -> None:
     """The search in grid cells must not miss the nearest point."""
     robot = oracles.with_spheres("box_arm")
-    rng = np.random.default_rng(3)
-    points = rng.normal(size=(3000, 3))
+    points = np.random.default_rng(3).normal(size=(3000, 3))
     points = 0.4 * points / np.linalg.norm(points, axis=1, keepdims=True) + np.array([0.7, 0.5, 0])
     cloud = thin_points(points, 0.004, 2.0)
     scene = rd.Scene([rd.Sphere(c[:3], c[3]) for c in cloud])
@@ -51,11 +49,10 @@ def test_the_nearest_of_a_dense_cloud() -> None:
 
 
 def test_empty_and_distant_clouds_are_empty_scenes() -> None:
-    robot = oracles.with_spheres("panda")
-    q = oracles.rows(robot, 200)
-    right = CollisionChecker(robot, rd.Scene()).free(q)
+    q = oracles.rows(PANDA, 200)
+    right = CollisionChecker(PANDA, rd.Scene()).free(q)
     for points in (np.zeros((0, 3)), np.full((5, 3), 50.0), np.array([[1e4, -1e4, 1e4], [-1e4, 0, 0]])):
-        checker = CollisionChecker(robot, rd.Scene([rd.PointCloud(points, 0.01)]))
+        checker = CollisionChecker(PANDA, rd.Scene([rd.PointCloud(points, 0.01)]))
         np.testing.assert_array_equal(checker.free(q), right)
         assert (checker.link_clearances(q) == 1).all()
 
@@ -74,18 +71,16 @@ def test_points_just_beyond_the_reach_count() -> None:
 
 @pytest.mark.parametrize("radius", [1e-9, 1e-4, 0.3])
 def test_tiny_and_large_points(radius: float) -> None:
-    robot = oracles.with_spheres("panda")
     points = np.random.default_rng(0).uniform([-0.8, -0.8, 0.0], [0.8, 0.8, 1.2], (20, 3))
     scene = rd.Scene([rd.PointCloud(points, radius)])
-    q = oracles.rows(robot, 500)
-    hit = (oracles.link_distances(robot, scene, q) < -oracles.TOLERANCE).any(axis=1)
-    assert not CollisionChecker(robot, scene).free(q)[hit].any()
+    q = oracles.rows(PANDA, 500)
+    hit = (oracles.link_distances(PANDA, scene, q) < -oracles.TOLERANCE).any(axis=1)
+    assert not CollisionChecker(PANDA, scene).free(q)[hit].any()
 
 
 def test_links_with_spheres_larger_than_the_grids_band() -> None:
     robot = replace(box_arm(), spheres={"l3": np.array([[0.2, 0, 0, 0.4]])}, meshes={})
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-1.6, 1.6, (40, 3)) * (1, 1, 0.2)
+    points = np.random.default_rng(0).uniform(-1.6, 1.6, (40, 3)) * (1, 1, 0.2)
     cloud = CollisionChecker(robot, rd.Scene([rd.PointCloud(points, 0.02)]))
     spheres = CollisionChecker(robot, rd.Scene([rd.Sphere(point, 0.02) for point in points]))
     q = oracles.rows(robot, 500)
@@ -98,16 +93,14 @@ def test_links_with_spheres_larger_than_the_grids_band() -> None:
 
 
 def test_mesh_obstacles_against_the_exact_surface() -> None:
-    robot = oracles.with_spheres("panda")
-    rng = np.random.default_rng(1)
     vertices, faces = oracles.box_triangles((0.3, 0.4, 0.5))
     center = np.array([0.5, 0.1, 0.4])
     wxyz = np.array([0.9, 0.1, 0.2, 0.3])
     scene = rd.Scene([rd.Mesh(vertices, faces, center, wxyz)])
-    q = rng.uniform(robot.lower, robot.upper, (1500, robot.dof))
-    free = CollisionChecker(robot, scene).free(q)
-    assert not ExactCollision(robot, scene).collides(q[free]).any()
-    solid = CollisionChecker(robot, rd.Scene([rd.Box(center, (0.3, 0.4, 0.5), wxyz)])).free(q)
+    q = np.random.default_rng(1).uniform(PANDA.lower, PANDA.upper, (1500, PANDA.dof))
+    free = CollisionChecker(PANDA, scene).free(q)
+    assert not ExactCollision(PANDA, scene).collides(q[free]).any()
+    solid = CollisionChecker(PANDA, rd.Scene([rd.Box(center, (0.3, 0.4, 0.5), wxyz)])).free(q)
     assert (free == solid).mean() > 0.97
 
 
@@ -123,9 +116,8 @@ def test_a_ground_of_huge_triangles_is_as_fine_as_a_small_one() -> None:
 
 @pytest.mark.parametrize(("shape", "count"), [((9, 12, 7), 4), ((1, 1, 30), 2), ((30, 1, 1), 1), ((20, 17, 13), 900)])
 def test_nearest_voxels_are_those_of_a_distance_transform(shape, count) -> None:
-    rng = np.random.default_rng(0)
     run = np.full(shape, -1, np.int32)
-    held = rng.choice(run.size, count, replace=False)
+    held = np.random.default_rng(0).choice(run.size, count, replace=False)
     run.ravel()[held] = np.arange(count)
     squares, holders = nearest_voxels(run)
     there = np.stack(np.unravel_index(held, shape), axis=-1)[holders]

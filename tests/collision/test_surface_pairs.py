@@ -43,8 +43,7 @@ def arm(wall: trimesh.Trimesh, link: trimesh.Trimesh, grazing: bool = True) -> r
 
 @cache
 def channel(grazing: bool = True) -> rd.Robot:
-    """A plate with a lip at each end. Its convex part also fills the hollow between the lips, which reach LIP
-    towards the arm."""
+    """A plate with a lip of height LIP at each end. Its convex part also fills the hollow between the lips."""
     y = 0.5 * np.sin(TURN) + 0.02 + GAP
     plate = ((-0.6, y, -0.05), (0.9, y + 0.02, 0.05))
     lips = (((x, y - LIP, -0.05), (x + 0.02, y + 0.02, 0.05)) for x in (-0.62, 0.9))

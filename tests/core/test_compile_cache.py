@@ -105,8 +105,7 @@ print(first(Pair(a=1, b=2)), sum(first.stats.cache_hits.values()))
 
 
 def test_what_compiled_code_depends_on_makes_it_compile_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Regression: Numba raised ModuleNotFoundError after modules had moved, and kept the old layout of a
-    changed class and old code and constants of other modules."""
+    """Regression: Numba failed after modules had moved, and kept old layouts of classes and old code of other modules."""
     package = tmp_path / "here" / "arm"
 
     def write(**files: str) -> None:
@@ -135,8 +134,7 @@ def test_what_compiled_code_depends_on_makes_it_compile_anew(tmp_path: Path, mon
 
 @pytest.mark.parametrize("name", ["stdout", "stderr"])
 def test_compiling_in_a_thread_leaves_the_streams_alone(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Regression: output of tests was lost. For each error of type inference, Numba lets colorama replace both
-    standard streams and then restores the previous ones, even if another thread has replaced them meanwhile."""
+    """Regression: for each error of type inference, Numba lets colorama replace both streams and restores the previous ones."""
     streams: list[io.StringIO] = []
 
     class Stream(io.StringIO):

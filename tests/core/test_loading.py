@@ -74,9 +74,8 @@ assert late[0] > 0, "nothing was loaded"
 
 def test_loading_takes_no_time_of_the_call(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = stop_clock(monkeypatch)
-    robot = rd.load_robot("panda")
-    middle = (robot.lower + robot.upper) / 2
-    context = PlanningContext("test", rd.Problem(robot, rd.Scene(), middle, middle))
+    middle = (PANDA.lower + PANDA.upper) / 2
+    context = PlanningContext("test", rd.Problem(PANDA, rd.Scene(), middle, middle))
     before = context.elapsed
     clock.now += 1.0
     with loading(), loading():
@@ -89,7 +88,7 @@ def test_loading_takes_no_time_of_the_call(monkeypatch: pytest.MonkeyPatch) -> N
     def build(_: rd.Robot) -> None:
         clock.now += 5.0
 
-    build(robot)
+    build(PANDA)
     assert context.elapsed - before == pytest.approx(1.0)
 
 

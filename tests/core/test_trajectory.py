@@ -32,8 +32,7 @@ def smooth(legs: int = 1, rate: float = 40.0) -> Trajectory:
 
 
 def pulse(step: float = 0.004, count: int = 6) -> Trajectory:
-    """Two pulses of acceleration, the second one braking. Each has `count` steps up and `count` steps down at
-    constant jerk, so that most of a pulse lies in a few rows at 125 Hz."""
+    """An accelerating and a braking pulse, each of `count` steps up and down at constant jerk: a few rows at 125 Hz."""
     half = np.concatenate([np.arange(count), np.arange(count, 0, -1)])
     a = 2.0 * np.concatenate([half, -half, [0]])[:, None] * np.array([[1.0, 0.5, -1.0]]) / count
     v = np.concatenate([np.zeros((1, 3)), np.cumsum((a[1:] + a[:-1]) / 2 * step, axis=0)])

@@ -197,6 +197,5 @@ print(len(signatures) > 0, read_only)
 
 
 def test_nothing_is_compiled_for_read_only_arrays() -> None:
-    """Otherwise all kernels of a plan and its validation would be compiled twice. In a separate process, since
-    tests call kernels with arrays of their own."""
+    """Otherwise a plan's kernels would be compiled twice. Apart, since tests call kernels with arrays of their own."""
     assert python(SIGNATURES).stdout == "True []\n"

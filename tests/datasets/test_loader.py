@@ -11,6 +11,7 @@ from torch.utils.data import DataLoader
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.example_robots import example_robot
+from helpers.panda import PANDA
 from helpers.refusals import refuses
 from helpers.stores import manifest_of, random_arrays, write_store
 from robotdiffuse.collision import CollisionChecker
@@ -153,27 +154,25 @@ def test_bad_input(store, tmp_path):
 
 
 def test_turned_motions_have_the_same_clearances():
-    robot = rd.load_robot("panda")
     rng = np.random.default_rng(3)
     packed = PackedScenes.pack([ROP_DENSE.scene(rng) for _ in range(6)], ROP_DENSE.max_obstacles, floor=True)
-    start, goal = rng.uniform(robot.lower, robot.upper, (2, 6, robot.dof))
+    start, goal = rng.uniform(PANDA.lower, PANDA.upper, (2, 6, PANDA.dof))
     q = np.linspace(start, goal, 20, axis=1).astype(np.float32)
-    q_turned, packed_turned, clear = turned(robot, q, packed, rng)
+    q_turned, packed_turned, clear = turned(PANDA, q, packed, rng)
     np.testing.assert_array_equal(q_turned[..., 1:], q[..., 1:])
-    assert (q_turned >= robot.lower.astype(np.float32)).all() and (q_turned <= robot.upper.astype(np.float32)).all()
+    assert (q_turned >= PANDA.lower.astype(np.float32)).all() and (q_turned <= PANDA.upper.astype(np.float32)).all()
     angle = q_turned[:, :, 0] - q[:, :, 0]
     assert np.ptp(angle, axis=1).max() < 1e-5 and np.abs(angle).max() > 0.1
     for i in range(len(packed)):
-        before = CollisionChecker(robot, packed.scene(i)).link_clearances(q[i])
-        after = CollisionChecker(robot, packed_turned.scene(i)).link_clearances(q_turned[i])
+        before = CollisionChecker(PANDA, packed.scene(i)).link_clearances(q[i])
+        after = CollisionChecker(PANDA, packed_turned.scene(i)).link_clearances(q_turned[i])
         np.testing.assert_allclose(after, before, atol=2e-5)
-        assert clear[i] == CollisionChecker(robot, rd.Scene([])).free(q_turned[i]).all()
+        assert clear[i] == CollisionChecker(PANDA, rd.Scene([])).free(q_turned[i]).all()
 
 
 def test_a_motion_that_uses_the_whole_range_of_the_first_joint_stays():
-    robot = rd.load_robot("panda")
-    q = np.linspace(robot.lower, robot.upper, 5)[None].astype(np.float32)
-    same, _, _ = turned(robot, q, PackedScenes.pack([rd.Scene([])], 1), np.random.default_rng(0))
+    q = np.linspace(PANDA.lower, PANDA.upper, 5)[None].astype(np.float32)
+    same, _, _ = turned(PANDA, q, PackedScenes.pack([rd.Scene([])], 1), np.random.default_rng(0))
     np.testing.assert_allclose(same, q, atol=1e-6)
 
 

@@ -98,8 +98,7 @@ def test_shards_are_whole_and_what_the_manifest_says(folder: Path) -> None:
 
 
 def checked_problem(row: dict[str, Any]) -> tuple[rd.Problem, CollisionChecker]:
-    rng = np.random.default_rng([SETTINGS.seed, int(row["seed"])])
-    number, drawn = draw(SETTINGS, PANDA, rng)
+    number, drawn = draw(SETTINGS, PANDA, np.random.default_rng([SETTINGS.seed, int(row["seed"])]))
     assert row["family"] == number
     floor = list(SETTINGS.families.values())[number].floor
     packed = PackedScenes.pack([drawn.scene], SETTINGS.slots, floor is not None)
@@ -284,8 +283,7 @@ def test_motions_are_free_reach_a_goal_and_keep_their_distance(name: str) -> Non
 
 
 def test_goals_a_turn_away_are_taken_the_short_way() -> None:
-    """Regression: for an arm whose joints have a range of two turns, a seventh of the motions went the long way
-    round, to a goal that the validator did not know."""
+    """Regression: for an arm whose joints have a range of two turns, a seventh of the motions went the long way round."""
     robot = rd.load_robot("ur5e")
     far = list[int]()
     settings = GenerationSettings(robot="ur5e", mix={"rop": 1.0}, target="pose", goals=1, waypoints=16)

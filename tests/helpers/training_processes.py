@@ -20,8 +20,7 @@ STOP_AFTER = 3
 
 
 def two(settings: PlannerTraining, out: Path) -> None:
-    """Trains without interruption, then with one; and runs a toy training whose second process gets a loss that
-    is not finite."""
+    """Trains without an interruption, then with one; and a toy training whose second process gets a loss that is not finite."""
     original = TrainingRun.step
 
     def first_step_kept(self):

@@ -14,8 +14,7 @@ from robotdiffuse.learning.training.loop import Processes, TrainingTask, Validat
 
 
 class ToyTask(TrainingTask):
-    """A training of a linear layer. The loss is the sum of its squared weights times a factor, which depends on the number of
-    the call."""
+    """A training of a linear layer, whose loss is its sum of squares times a factor that depends on the number of the call."""
 
     title = "toy"
 

@@ -84,8 +84,7 @@ def refuse(file: Path, message: str, topic: str | None = None) -> None:
 
 
 def in_mcap(file: Path) -> tuple[dict[str, Any], list[Any], dict[str, bytes], list[tuple[str, str]]]:
-    """The contents of an MCAP file: entities of the scene by name, frames at each time, attachments, and topic
-    and type of each message."""
+    """An MCAP file's entities of the scene by name, frames at each time, attachments, and topic and type of each message."""
     from mcap.reader import make_reader
     from mcap_protobuf.decoder import DecoderFactory
 

@@ -112,8 +112,7 @@ def test_fused_and_unfused_attention_agree(monkeypatch, causal):
 
 
 def test_unet_pads_and_crops():
-    """Motions are padded by their last waypoint to a length that can be halved often enough; such lengths are
-    not padded."""
+    """Motions are padded by their last waypoint to a length that can be halved often enough, unless they have one."""
     for waypoints, padding in ((12, 0), (13, 3), (254, 2), (1, 3)):
         network = denoiser("unet", waypoints)
         assert network.padding == padding

@@ -124,8 +124,7 @@ def test_a_full_step_is_newton_s() -> None:
 
 
 def test_together_they_reach_a_free_and_short_path_that_none_reaches_alone() -> None:
-    """A zigzag through a ball: the cost of collision alone leaves the zigzag, and the cost of length alone
-    leaves the path in the ball."""
+    """A zigzag through a ball: the cost of collision alone leaves the zigzag, that of length alone the path in the ball."""
     checker, (line, _) = swing()
     line[1::2, 0] += 0.05
     line[-1, 0] = 0.8

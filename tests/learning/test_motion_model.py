@@ -51,8 +51,7 @@ def test_nearest_and_chamfer_against_all_pairs():
 @pytest.mark.parametrize("smooth", [False, True])
 def test_noise_is_zero_at_the_ends_and_has_the_data_s_covariance(smooth):
     s = np.linspace(0, np.pi, 16)[:, None]
-    residuals = np.random.default_rng(0).standard_normal((500, 1, 2)) * np.sin(s)
-    factor = noise_factor(residuals, smooth)
+    factor = noise_factor(np.random.default_rng(0).standard_normal((500, 1, 2)) * np.sin(s), smooth)
     covariance = factor @ factor.T
     assert not covariance[[0, -1]].any()
     assert np.trace(covariance) / 14 == pytest.approx(1.0, abs=1e-3)

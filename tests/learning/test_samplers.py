@@ -166,8 +166,7 @@ def test_objective_round_trip(name, as_given):
 @pytest.mark.parametrize("limit", [5.0, 100.0])
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_objectives_weigh_levels_alike(name, limit):
-    """The weighted error of the output equals that of the clean trajectory wherever the weight is below its
-    limit."""
+    """The weighted error of the output equals that of the clean trajectory wherever the weight is below its limit."""
     schedule = cosine_schedule()
     objective = OBJECTIVES[name]
     t = np.arange(1, 200)

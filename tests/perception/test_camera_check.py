@@ -137,8 +137,7 @@ POINTS = np.stack(np.meshgrid((-0.5, 0.0, 0.5), (-0.5, 0.0, 0.5), (0.1, 0.8)), a
 
 def misplaced(view: rd.DepthView, seed: int) -> rd.DepthView:
     """The view with a pose error as large as stated."""
-    rng = np.random.default_rng(seed)
-    shift, axis = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+    shift, axis = (v / np.linalg.norm(v) for v in np.random.default_rng(seed).standard_normal((2, 3)))
     error = np.eye(4)
     error[:3, 3] = STATED[0] * shift
     error[:3, :3] = Rotation.from_rotvec(STATED[1] * axis).as_matrix()

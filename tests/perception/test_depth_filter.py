@@ -32,8 +32,7 @@ def view_from(distance: float) -> rd.DepthView:
 @pytest.mark.parametrize("distance", (1.2, 2.5))
 @pytest.mark.parametrize("correlation", (0.0, 1.5, 2.5))
 def test_the_estimated_noise_is_that_of_the_sensor(spread: float, distance: float, correlation: float) -> None:
-    """Regression: the differences of neighboring pixels, which have correlated errors, showed only an eighth of
-    recorded noise."""
+    """Regression: differences of neighboring pixels, whose errors are correlated, showed an eighth of recorded noise."""
     noise = DepthNoise(spread=spread, correlation=correlation)
     found, neighbors = patch_noise(noise.applied(view_from(distance), np.random.default_rng(0)).depth)
     assert 0.75 < found / spread < 1.2, "planes take away what goes together over a patch"
@@ -137,8 +136,7 @@ def test_rays_through_the_arm_are_not_empty() -> None:
 
 
 def test_the_arm_beside_its_own_camera_leaves_open_space_open() -> None:
-    """Regression: regions beside the near arm counted as surfaces too near to be measured. The gripper, 9 mm
-    beside the camera and enlarged by 15 mm, hid half of the image, so looks showed nothing."""
+    """Regression: regions beside the near arm counted as too near to be measured, so the gripper hid half of the image."""
     camera = wrist_camera(PANDA)
     q = np.array([-0.9, -1.6, -1.4, -2.3, 0.1, 1.1, -1.1])
     view = ray_cast(rd.Scene([FLOOR]), camera.poses(PANDA, q[None])[0], camera.intrinsics, camera.size, PANDA, q)
@@ -150,8 +148,7 @@ def test_the_arm_beside_its_own_camera_leaves_open_space_open() -> None:
 
 
 def test_a_straight_edge_is_not_the_end_of_the_image() -> None:
-    """Regression: a board's edge along a row was taken for the border of a cropped image, although there are
-    returns beyond it."""
+    """Regression: a board's edge along a row was taken for the border of a cropped image, despite returns beyond it."""
     depth = np.zeros((240, 320))
     depth[100:] = 1.0
     assert empty_regions(depth, 2.0) is None, "cropped, perhaps"
@@ -180,8 +177,7 @@ def test_the_filter_takes_the_median_of_the_returns_and_adds_none_but_in_single_
 
 @pytest.mark.parametrize("distance", (1.5, 3.0))
 def test_points_of_the_arm_are_taken_away_with_noise_too(distance: float) -> None:
-    """Regression: a fixed margin of 2 cm left points of the arm at three deviations of the noise, so starts
-    were in collision."""
+    """Regression: a margin of 2 cm left points of the arm at three deviations of the noise, so starts collided."""
     points = seen_points([DepthNoise().applied(view_from(distance), np.random.default_rng(1))], PANDA, HOME)
     assert len(points[(np.abs(points[:, 1]) < 0.12) & (points[:, 2] > 0.25)]) <= 2, "only the arm is there"
 

@@ -189,8 +189,7 @@ def test_what_is_wrong_in_a_file(entry: object, message: str, tmp_path: Path) ->
 
 
 def test_points_that_were_seen_are_sampled_as_a_cloud() -> None:
-    """Regression: the network needed surface points of a scene with a kind of point cloud, and the sampling
-    looked for a mesh."""
+    """Regression: the network needed surface points of a kind of point cloud, and the sampling looked for a mesh."""
     points = np.random.default_rng(0).uniform(0.2, 0.5, (50, 3))
     found = sample_surface(rd.Scene([SeenPoints(points, 0.01)]), 20, np.random.default_rng(1))
     assert len(found) == 20 and all((point == points).all(axis=1).any() for point in found)

@@ -43,8 +43,7 @@ def centers() -> np.ndarray:
 
 
 def ahead(seen: ObservedVolume) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """For the voxels along x straight ahead of the camera: their places, and whether they are occupied, free,
-    behind a surface."""
+    """Of voxels straight ahead of the camera: their x, and whether they are occupied, free, behind a surface."""
     j, k = (int((at - low) / VOXEL) for at, low in zip((0.01, 0.51), LOW[1:], strict=True))
     return centers()[:, j, k, 0], seen.occupied[:, j, k], seen.free[:, j, k], seen.behind[:, j, k]
 

@@ -112,8 +112,7 @@ def test_strict_motions_enter_no_voxel_that_was_not_seen_free() -> None:
 
 
 def test_nothing_further_than_the_margin_from_a_goal_is_exempt() -> None:
-    """Regression: corners of voxels that count as free were up to 4.7 cm away, though the documented margin was
-    2 cm."""
+    """Regression: corners of voxels that count as free were up to 4.7 cm away, though the documented margin was 2 cm."""
     rng = np.random.default_rng(0)
     known = OccupancyMap(PANDA)
     for low in rng.uniform(MAP.low, (0.8, 0.8, 1.0), size=(300, 3)):
@@ -195,8 +194,7 @@ def test_a_strict_arm_does_not_look_for_a_goal_outside_of_the_map() -> None:
 
 
 def test_a_look_is_found_where_a_narrow_gap_alone_leads_out() -> None:
-    """Regression: searches to viewpoints that were chosen first failed in four scenes in which a tree of
-    motions gets out."""
+    """Regression: searches to viewpoints that were chosen first failed in four scenes where a tree of motions gets out."""
     known = OccupancyMap(PANDA)
     known.declare_free(((-1.1, 0.3, 0.0), (1.1, 1.1, 1.1)))
     scene = rd.Scene(not_seen_free(known, rd.Scene(), HOME))
@@ -245,8 +243,7 @@ def test_where_no_look_can_be_reached_the_arm_leaves_a_goal_by_the_way_in() -> N
 
 
 def test_without_the_network_a_motion_through_space_seen_free_is_certain_enough() -> None:
-    """Regression: under `probabilistic` the arm never stopped looking, since the highest stated confidence was
-    0.82."""
+    """Regression: under `probabilistic` the arm never stopped looking, since the highest stated confidence was 0.82."""
     step = explorer("probabilistic", goal=PROBLEM.start + 0.02, predict=False).next(PROBLEM.start)
     assert (step.kind, step.policy, step.confidence) == ("go", "strict", None)
 
@@ -261,8 +258,7 @@ ABOVE_AND_BESIDE = ((1.3, -0.5, 0.6), (-0.3, 1.1, 0.9), (0.4, 1.3, 0.2))
 
 
 def test_a_goal_behind_a_plate_is_refused_until_views_show_it() -> None:
-    """Without `see_goal`, `strict` accepts the goal unseen: the whole motion is within 2 cm of the arm at its
-    start or goal."""
+    """Without `see_goal`, `strict` accepts the goal unseen: the motion is within 2 cm of the arm at start or goal."""
     with pytest.raises(rd.InputError, match=r"explorer.see_goal is true and explorer.policy 'probabilistic'"):
         rd.ExplorerSettings(policy="probabilistic", see_goal=True)
     plate = rd.Box((1.0, 0.7, 0.6), (0.02, 0.8, 1.2), wxyz=(0.94, 0, 0, 0.34))

@@ -88,8 +88,7 @@ def test_no_slower_than_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_ends_where_the_arm_gets_sooner(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Several configurations reach the last pose. Following the line leads to one of them, which may take
-    longer to reach than another."""
+    """Of several configurations at the last pose, the line leads to one that may be further away than another."""
     found = {name: planned(T).duration for name, T in LINES.items()}
     monkeypatch.setattr(line_following, "faster_ends", lambda *_: [])
     plain = {name: planned(T).duration for name, T in LINES.items()}

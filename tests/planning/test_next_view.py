@@ -34,8 +34,7 @@ def result(problem: Problem) -> PlanResult:
 
 
 def test_what_hides_counts_as_often_as_it_is_there() -> None:
-    """One voxel between two cameras along x. In front of one camera is a voxel that is occupied with
-    probability 0.5."""
+    """One voxel between two cameras along x, one of which sees it behind a voxel that is occupied at 0.5."""
     filled = np.zeros((20, 9, 9), np.float32)
     filled[14, 4, 4] = 0.5
     voxel = np.array([[8, 4, 4]])

@@ -79,8 +79,7 @@ for result in rd.plan_many(problems, "rrt_connect", workers=2):
 
 @pytest.mark.parametrize("others", ["", "raise SystemExit", pytest.param("import os; os._exit(0)", marks=pytest.mark.slow)])
 def test_a_script_that_processes_cannot_import_is_an_error(others: str, tmp_path: Path) -> None:
-    """Regression: the call hung, since the robots that a starting process gets do not fit into a pipe that
-    nobody reads."""
+    """Regression: the call hung, since the robots for a starting process do not fit into a pipe that nobody reads."""
     script = tmp_path / "script.py"
     script.write_text(f'if __name__ != "__main__":\n    {others or "pass"}\n{PLANS}')
     ended = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=500)

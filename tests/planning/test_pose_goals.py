@@ -14,6 +14,7 @@ from numpy import ndarray
 import robotdiffuse as rd
 from helpers.commands import written as write_record
 from helpers.made_arms import chain, read_urdf, row, written
+from helpers.panda import PANDA
 from helpers.refusals import refuses
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.collision import CollisionChecker
@@ -36,8 +37,7 @@ def baxter() -> rd.Robot:
 @cache
 def free() -> ndarray:
     robot = baxter()
-    rng = np.random.default_rng(4)
-    drawn = rng.uniform(robot.lower, robot.upper, (400, robot.dof))
+    drawn = np.random.default_rng(4).uniform(robot.lower, robot.upper, (400, robot.dof))
     return drawn[CollisionChecker(robot, rd.Scene([TABLE])).free(drawn)]
 
 
@@ -75,8 +75,7 @@ def test_links_that_share_a_joint_are_brought_there_together(tmp_path: Path) -> 
     arms = (chain("waist_link", row(side, 6)) for side in ("left_", "right_"))
     parts = chain("base", ["waist"]), *arms
     robot = read_urdf(written(tmp_path, *parts), group="both")
-    there = np.random.default_rng(1).uniform(0.5 * robot.lower, 0.5 * robot.upper)
-    goal = poses_at(robot, there, robot.tips)
+    goal = poses_at(robot, np.random.default_rng(1).uniform(0.5 * robot.lower, 0.5 * robot.upper), robot.tips)
     problem = rd.Problem(robot, rd.Scene(), np.zeros(robot.dof), goal)
     found = pose_configurations(problem, goal, np.random.default_rng(0))
     assert len(found) and max(off(robot, goal, q) for q in found) < 1e-5
@@ -113,9 +112,8 @@ def test_a_pose_out_of_reach_is_named_alone() -> None:
     result = rd.plan(rd.Problem(baxter(), rd.Scene(), start, goal), time_limit=60.0)
     assert result.status is rd.Status.UNREACHABLE_GOAL
     assert result.reason.endswith("brings left_gripper to the pose at (3.000, 0.000, 0.000) m")
-    robot = rd.load_robot("panda")
-    goal = rd.PoseGoal(robot.tip, transform(np.array([0.0, 0.0, 1.5])))
-    result = rd.plan(rd.Problem(robot, FREE, apart(robot, 1)[0], goal))
+    goal = rd.PoseGoal(PANDA.tip, transform(np.array([0.0, 0.0, 1.5])))
+    result = rd.plan(rd.Problem(PANDA, FREE, apart(PANDA, 1)[0], goal))
     assert result.status is rd.Status.UNREACHABLE_GOAL
 
 
@@ -155,16 +153,14 @@ FREE = rd.Scene()
 
 
 def apart(robot: rd.Robot, count: int, seed: int = 5) -> ndarray:
-    rng = np.random.default_rng(seed)
     middle = 0.5 * (robot.lower + robot.upper)
     half = 0.5 * (robot.upper - robot.lower)
-    drawn = rng.uniform(middle - 0.9 * half, middle + 0.9 * half, (60 * count, robot.dof))
+    drawn = np.random.default_rng(seed).uniform(middle - 0.9 * half, middle + 0.9 * half, (60 * count, robot.dof))
     return drawn[CollisionChecker(robot, FREE).free(drawn)][:count]
 
 
 def followed(robot: rd.Robot, start: ndarray, shift: ndarray) -> ndarray | None:
-    """The configuration after the tip has moved straight by `shift`, with the smallest joint motion; None if
-    the arm cannot, or comes close to a singularity."""
+    """The nearest configuration after the tip has moved straight by `shift`; None out of reach or near a singularity."""
     q = start.copy()
     T = link_pose(robot, q, robot.tip)
     target = T.copy()
@@ -260,12 +256,11 @@ def test_arms_of_few_joints_reach_poses_with_tolerances(arm: str, kind: str, tmp
 
 
 def many_grasps() -> tuple[rd.Problem, ndarray]:
-    robot = rd.load_robot("panda")
-    q = apart(robot, 40)
-    balls = [rd.Sphere(link_pose(robot, row, robot.tip)[:3, 3], 0.05) for row in q[1:11]]
-    q_free = q[11:][CollisionChecker(robot, rd.Scene(balls)).free(q[11:])][:10]
-    goals = [rd.PoseGoal(robot.tip, link_pose(robot, row, robot.tip)) for row in (*q[1:11], *q_free)]
-    return rd.Problem(robot, rd.Scene(balls), q[0], rd.AnyGoal(tuple(goals))), q_free
+    q = apart(PANDA, 40)
+    balls = [rd.Sphere(link_pose(PANDA, row, PANDA.tip)[:3, 3], 0.05) for row in q[1:11]]
+    q_free = q[11:][CollisionChecker(PANDA, rd.Scene(balls)).free(q[11:])][:10]
+    goals = [rd.PoseGoal(PANDA.tip, link_pose(PANDA, row, PANDA.tip)) for row in (*q[1:11], *q_free)]
+    return rd.Problem(PANDA, rd.Scene(balls), q[0], rd.AnyGoal(tuple(goals))), q_free
 
 
 def tried(monkeypatch: pytest.MonkeyPatch, seconds: float) -> list[ndarray]:
@@ -313,17 +308,16 @@ def test_of_several_goals_no_more_are_tried_late(monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_goal_index_names_the_goal_that_is_reached() -> None:
-    robot = rd.load_robot("panda")
-    start, near, far = apart(robot, 3)
+    start, near, far = apart(PANDA, 3)
     for goal, index in (([far, start], 1), (rd.AnyGoal((rd.JointGoal([far, near]), rd.JointGoal(start))), 1), (start, 0)):
-        assert rd.plan(rd.Problem(robot, FREE, start, goal)).goal_index == index
+        assert rd.plan(rd.Problem(PANDA, FREE, start, goal)).goal_index == index
     # poses 2 mm apart: both are within the validator's centimeter
-    T = link_pose(robot, near, robot.tip)
+    T = link_pose(PANDA, near, PANDA.tip)
     T_beside = transform(T[:3, 3] + [0.002, 0, 0], T[:3, :3])
-    goals = rd.AnyGoal((rd.PoseGoal(robot.tip, T_beside), rd.PoseGoal(robot.tip, T)))
-    result = rd.plan(rd.Problem(robot, FREE, start, goals))
+    goals = rd.AnyGoal((rd.PoseGoal(PANDA.tip, T_beside), rd.PoseGoal(PANDA.tip, T)))
+    result = rd.plan(rd.Problem(PANDA, FREE, start, goals))
     assert result.goal_index is not None
     reached = goals.goals[result.goal_index]
     assert isinstance(reached, rd.PoseGoal)
-    error = link_pose(robot, result.path.positions[-1], robot.tip) - reached.T_base_frame
+    error = link_pose(PANDA, result.path.positions[-1], PANDA.tip) - reached.T_base_frame
     assert np.abs(error).max() < 1e-4

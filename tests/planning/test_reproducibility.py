@@ -31,8 +31,7 @@ print("compiled", len(compiled))
 
 
 def motions(threads: int) -> list[str]:
-    """A line for each motion, printed by a process that does not compile; in a process that compiles, the last
-    bits may differ."""
+    """A line for each motion, by a process that does not compile: in one that compiles, the last bits may differ."""
     counts = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS"), str(threads))
     for _ in range(2):
         done = subprocess.run(
@@ -60,8 +59,7 @@ def test_the_same_seed_gives_the_same_motion() -> None:
 
 @pytest.mark.parametrize("planner", ["aorrtc", "rrt_connect"])
 def test_the_first_call_and_later_ones_give_the_same_path_although_paths_are_refused(planner, monkeypatch):
-    """Regression: the duration of validations in earlier calls decided when later calls validated, and a
-    refused path changes what the search does next."""
+    """Regression: the duration of earlier validations decided when later calls validated, which changes their search."""
     accepted = Verifier.path
     refusals = list[float]()
 

@@ -39,8 +39,7 @@ def problem(*constraints: Constraint, robot: rd.Robot = PANDA) -> rd.Problem:
 
 
 def true_values(made: rd.Problem, constraint: Constraint, q: np.ndarray) -> list[float]:
-    """The values of a constraint at a configuration, which `PathConstraints.values` must return, by the
-    definition of the constraint."""
+    """What `PathConstraints.values` must return, by the definition of the constraint."""
     T = link_pose(made.robot, q, constraint.frame)
     p = T[:3, 3]
     if isinstance(constraint, rd.AxisCone):
@@ -68,16 +67,14 @@ def true_values(made: rd.Problem, constraint: Constraint, q: np.ndarray) -> list
 @pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)
 def test_values_are_those_of_the_book(constraint: Constraint) -> None:
     made = problem(constraint)
-    rng = np.random.default_rng(0)
-    q = np.concatenate([[START, GOAL], rng.uniform(PANDA.lower, PANDA.upper, (30, 7))])
+    q = np.concatenate([[START, GOAL], np.random.default_rng(0).uniform(PANDA.lower, PANDA.upper, (30, 7))])
     right = [true_values(made, constraint, row) for row in q]
     np.testing.assert_allclose(PathConstraints(made).values(q), right, atol=1e-7)
 
 
 @pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)
 def test_what_is_proved_holds_at_every_sample_and_what_is_not_proved_does_not(constraint: Constraint) -> None:
-    """With a limit slightly above the largest of many sampled values, the proof succeeds; with a limit slightly
-    below, it fails."""
+    """The proof succeeds for a limit slightly above the largest of many sampled values, and fails slightly below."""
     made = problem(constraint)
     rng = np.random.default_rng(1)
     ready = PathConstraints(made)
@@ -126,8 +123,7 @@ def test_proofs_hold_for_sliding_and_endless_joints_on_skew_axes() -> None:
 @pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)
 def test_projection_ends_where_the_constraint_is_kept(constraint: Constraint) -> None:
     ready = PathConstraints(problem(constraint))
-    rng = np.random.default_rng(2)
-    found = ready.projected(rng.uniform(PANDA.lower, PANDA.upper, (50, 7)), 0.9)
+    found = ready.projected(np.random.default_rng(2).uniform(PANDA.lower, PANDA.upper, (50, 7)), 0.9)
     assert len(found) >= 20 and ready.satisfied(found, 0.9).all()
     assert ((found >= PANDA.lower) & (found <= PANDA.upper)).all()
 

@@ -51,8 +51,7 @@ def test_settings_can_be_kept_in_a_manifest(name: str) -> None:
 
 
 def test_position_of_the_tip_is_uniform_in_the_region() -> None:
-    """Targets are uniform, as those of the paper's authors: their mean is within five standard deviations of
-    the middle."""
+    """Targets are uniform, as the authors': their mean is within five standard deviations of the middle."""
     rng = np.random.default_rng(2)
     empty = replace(ROP, obstacles=(0, 0), tip_x=(0.3, 0.5), tip_y=(-0.2, 0.2), tip_z=(0.3, 0.6))
     targets = [empty.draw(PANDA, rng, target=POSITION).T_base_tip[:3, 3] for _ in range(100)]
@@ -87,8 +86,7 @@ def test_a_scaled_arm_reaches_so_many_times_as_far_and_touches_itself_at_the_sam
 
 @pytest.mark.parametrize("name", FAMILIES)
 def test_problems_of_an_arm_of_five_joints_and_a_third_of_the_reach(name: str) -> None:
-    """Regression: only ROP had problems for this arm: furniture was out of reach, and the arm reaches few
-    poses."""
+    """Regression: only ROP had problems for this arm: furniture was out of reach, and the arm reaches few poses."""
     family = family_for(name, SMALL)
     assert isinstance(family, ScaledFamily) and family.scale == 0.4
     drawn = family.draw(SMALL, np.random.default_rng(3), 2, POSE)

@@ -37,8 +37,7 @@ def test_rpy_of_a_rotation_is_scipys() -> None:
 
 
 def off(goal: rd.PoseGoal, xyz: Any, rpy: Any) -> bool:
-    """Whether a pose that differs from the goal's by xyz and rpy misses the goal. The pose is that of the arm
-    at START, and the goal is placed accordingly."""
+    """Whether a pose that differs by xyz and rpy from that of the arm at START misses the goal, which is placed there."""
     q = np.array(START)
     T = link_pose(ROBOT, q, goal.frame) @ inverse(transform(np.array(xyz, float), rotation_from_rpy(*map(float, rpy))))
     moved = rd.PoseGoal(goal.frame, T, goal.xyz_tolerance, goal.rpy_tolerance)

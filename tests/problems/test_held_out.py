@@ -11,8 +11,7 @@ from robotdiffuse.problems.held_out import Case, CaseFile, held_out_problem, lin
 
 
 class Referee:
-    """A validator that accepts the straight line of every third problem, and a search that fails on every
-    fifth."""
+    """A validator that accepts the straight line of every third problem, and a search that fails on every fifth."""
 
     def __init__(self) -> None:
         self.validated: list[rd.Problem] = []

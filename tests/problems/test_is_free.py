@@ -39,10 +39,9 @@ def test_out_of_limits_is_a_reason_and_a_wrong_shape_an_error() -> None:
 
 
 def test_it_agrees_with_the_validator() -> None:
-    rng = np.random.default_rng(0)
     scene = rd.Scene([rd.Box([0.5, 0, 0.4], [0.3, 0.6, 0.05]), rd.Sphere([-0.3, 0.3, 0.6], 0.2)])
     states = []
-    for q in rng.uniform(PANDA.lower, PANDA.upper, (60, 7)):
+    for q in np.random.default_rng(0).uniform(PANDA.lower, PANDA.upper, (60, 7)):
         problem = rd.Problem(PANDA, scene, q, q)
         report = rd.verify(problem, rd.Path(PANDA.joint_names, q[None]))
         states.append(bool(problem.is_free(q)))
@@ -115,8 +114,7 @@ def test_what_views_see_in_reach_is_no_scene_beyond_it() -> None:
 
 
 def test_a_cloud_that_the_arm_stands_in_is_noted() -> None:
-    points = np.random.default_rng(0).uniform(-0.5, 0.8, (3000, 3))
-    scene = rd.Scene([rd.PointCloud(points, name="scan")])
+    scene = rd.Scene([rd.PointCloud(np.random.default_rng(0).uniform(-0.5, 0.8, (3000, 3)), name="scan")])
     result = rd.load_planner("aorrtc").plan(rd.Problem(PANDA, scene, HOME, TO), time_limit=60.0)
     assert result.status is rd.Status.INVALID_START
     assert "points of scan are within the arm" in result.notes[0] and "millimeters" in result.notes[0]

@@ -47,8 +47,7 @@ def test_a_single_worker_is_replaced_when_it_dies_or_is_ended(worker: Worker) ->
 
 
 def test_closing_waits_for_a_process_that_is_starting(worker: Worker, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Regression: after Ctrl-C, the program exited between the start of a worker and the message that says what to run, and
-    the worker printed a traceback."""
+    """Regression: if the program exited while a worker started, the worker printed a traceback."""
     begun, spawn = threading.Event(), util.spawnv_passfds
     pids: list[int] = []
 
@@ -151,8 +150,7 @@ def fail_without(file: str) -> bool:
 
 
 def test_ready_workers_are_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`prepare` returns True in the first process, as after compiling, so a second process replaces the first.
-    A killed worker is replaced too."""
+    """A second process replaces the first if `prepare` returns True, as after compiling, and one that is killed."""
     with Workers(1, fail_without, (str(tmp_path / "file"),), keep_ready=True) as workers:
         workers.start()
         [worker] = workers.workers
@@ -207,8 +205,7 @@ def test_shared_calls_of_a_script_that_processes_cannot_import_say_what_to_do(by
 
 
 def test_calls_while_the_first_process_starts_wait_for_it() -> None:
-    """Regression: a call during the start of the process started it again, and both calls read the answers of
-    one connection."""
+    """Regression: a call during the start started the process again, and both calls read one connection."""
     with Workers(1, time.sleep, (0.5,), keep_ready=True) as workers:
         starting = threading.Thread(target=workers.start)
         starting.start()

@@ -9,6 +9,7 @@ from numpy import ndarray
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm, box_mesh
+from helpers.panda import PANDA
 from helpers.refusals import refuses
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.transforms import rotation_about, transform
@@ -118,26 +119,24 @@ def test_allowed_contacts_are_named_and_all_else_is_checked() -> None:
 
 
 def test_held_objects_stay_with_other_locked_joints() -> None:
-    panda = rd.load_robot("panda")
-    held = panda.attach(SHAPES[2], "panda_hand")
+    held = PANDA.attach(SHAPES[2], "panda_hand")
     closed = held.with_locked({"panda_finger_joint1": 0.0})
-    assert closed is panda.with_locked({"panda_finger_joint1": 0.0}).attach(SHAPES[2], "panda_hand")
-    assert closed.detach("cup") is panda.with_locked({"panda_finger_joint1": 0.0})
+    assert closed is PANDA.with_locked({"panda_finger_joint1": 0.0}).attach(SHAPES[2], "panda_hand")
+    assert closed.detach("cup") is PANDA.with_locked({"panda_finger_joint1": 0.0})
 
 
 def test_a_tool_is_the_tip_and_its_shapes_are_in_the_frame_of_its_link() -> None:
-    panda = rd.load_robot("panda")
     T_hand_tool = transform(np.array([0.0, 0.0, 0.15]), rotation_about(np.array([1.0, 0, 0]), 0.3))
-    robot = panda.with_tool("panda_hand", T_hand_tool, [rd.Cylinder([0, 0, 0.1], 0.01, 0.1)])
+    robot = PANDA.with_tool("panda_hand", T_hand_tool, [rd.Cylinder([0, 0, 0.1], 0.01, 0.1)])
     q = np.array([0.1, 0.2, 0.3, -1.5, 0.2, 1.5, 0.3])
-    T_base_tool = link_pose(panda, q, "panda_hand") @ T_hand_tool
+    T_base_tool = link_pose(PANDA, q, "panda_hand") @ T_hand_tool
     assert robot.tip == "tool"
     assert np.allclose(link_pose(robot, q, "tool"), T_base_tool)
     on_axis = np.array([0.0, 0.0, 0.05, 1.0]), np.array([0.0, 0.0, 0.15, 1.0])
     for point in on_axis:
         local = np.linalg.inv(T_hand_tool) @ point
         assert inside(robot.meshes["tool"][0], local[None, :3], 1e-9).all()
-    assert "tool" not in panda.with_tool("panda_hand", T_hand_tool).spheres, "a mere frame"
+    assert "tool" not in PANDA.with_tool("panda_hand", T_hand_tool).spheres, "a mere frame"
 
 
 def test_what_cannot_be_held_is_refused_in_one_line() -> None:

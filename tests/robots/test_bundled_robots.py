@@ -51,8 +51,7 @@ def test_licenses_are_named(name: str) -> None:
 
 
 def test_joints_that_turn_twice_are_drawn_without_needless_turns() -> None:
-    """Regression: shelf problems were unsolvable: start and goal differed by turns of a UR's shoulder, which
-    the floor blocks."""
+    """Regression: shelf problems were unsolvable: start and goal differed by turns of a shoulder, which the floor blocks."""
     robot = load_robot("ur5e")
     q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (50, 6))
     least = robot.unwound(q)

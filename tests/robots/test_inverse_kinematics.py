@@ -94,8 +94,7 @@ def test_unreachable_poses_give_nothing(xyz: tuple[float, float, float]) -> None
 
 
 def test_a_narrow_range_of_acceptance_is_found() -> None:
-    """Configurations near rejected solutions are tried too: here, only a range of 0.02 rad of the elbow is
-    accepted."""
+    """Configurations near rejected ones are tried too: only a range of 0.02 rad of the elbow is accepted."""
     robot = example_robot("panda")
     rng = np.random.default_rng(8)
     T = link_pose(robot, (robot.lower + robot.upper) / 2, "panda_hand")

@@ -18,8 +18,7 @@ RIGHT = "panda_finger_joint2"
 
 
 def test_fifty_problem_files_with_locked_joints_share_one_robot(tmp_path: Path) -> None:
-    """Regression: each file made a new object whose arrays the first plan prepared: 95 ms per plan instead of
-    18."""
+    """Regression: each file made a new object, whose arrays its first plan prepared: 95 ms per plan instead of 18."""
     robot = rd.load_robot("panda", locked={LEFT: 0.035, RIGHT: 0.035})
     start = (robot.lower + robot.upper) / 2
     for i in range(50):

@@ -11,6 +11,7 @@ import pytest
 import robotdiffuse as rd
 from helpers.example_robots import example_robot
 from helpers.made_arms import chain, read_urdf, row, written
+from helpers.refusals import refuses
 from robotdiffuse.certificates.requirements import constraint_bounds
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
@@ -45,8 +46,7 @@ def test_both_arms_and_the_joint_that_they_share_are_planned(tmp_path: Path) -> 
         assert robot.tips == ("left_4_link", "right_4_link") and not robot.locked
         assert robot.parents.tolist() == [0, 1, 2, 3, 4, 1, 6, 7, 8] and robot.kernel_parents is not None
         assert robot.chain("right_2_link") == (0, 5, 6) and robot.at_end("left_4_link")
-    with pytest.raises(rd.InputError, match="choose one, or both as one robot"):
-        read_urdf(written(tmp_path, *PARTS))
+    refuses("choose one, or both as one robot", read_urdf, written(tmp_path, *PARTS))
     left = read_urdf(written(tmp_path, *PARTS), group="left")
     assert left.kernel_parents is None and left.tips == ("left_4_link",)
     held = robot.with_locked({name: 0.1 for name in row("right_", 4)})
@@ -81,8 +81,7 @@ def test_files_keep_all_tips(tmp_path: Path) -> None:
 
 
 def test_spheres_parts_and_the_arms_of_one_robot_agree() -> None:
-    """Configurations that are free by spheres are free by parts. The poses of Baxter's left arm equal those of
-    the robot `baxter_left`."""
+    """What is free by spheres is free by parts; poses of Baxter's left arm are those of `baxter_left`."""
     robot = two_arms()
     rng = np.random.default_rng(0)
     q = rng.uniform(robot.lower, robot.upper, (2000, robot.dof))
@@ -136,9 +135,8 @@ def _crossing(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
 
 def test_what_one_arm_keeps_is_not_loosened_by_the_other() -> None:
     robot = two_arms()
-    rng = np.random.default_rng(7)
     plane = rd.OnPlane("right_hand", point=[0.0, 0.0, 0.5], normal=[0.0, 0.6, 0.8], tolerance=5.0)
-    ends = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
+    ends = np.random.default_rng(7).uniform(robot.lower, robot.upper, (2, robot.dof))
     q = np.linspace(ends[0], ends[1], 12)
     problem = rd.Problem(robot=robot, scene=rd.Scene(), start=q[0], goal=rd.JointGoal(q[-1:]), constraints=[plane])
     bounds = constraint_bounds(problem, q, 0.0)[1][:, 0]
@@ -181,8 +179,7 @@ def test_a_tool_on_the_second_hand_is_its_tip_and_is_checked() -> None:
 
 
 def test_both_arms_reach_as_far_as_one() -> None:
-    """Regression: the reach was the sum of the offsets of both arms, which doubled the width of lines on the
-    live page."""
+    """Regression: the reach was the sum of both arms' offsets, which doubled the width of lines on the live page."""
     both, left, right = (rd.load_robot(f"baxter{arm}") for arm in ("", "_left", "_right"))
     assert reach(both) == pytest.approx(max(reach(left), reach(right)), rel=0.01)  # of random configurations
     assert reach_bound(both) <= max(reach_bound(left), reach_bound(right)) + 1e-9

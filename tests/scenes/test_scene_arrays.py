@@ -1,5 +1,4 @@
-"""Scenes packed in arrays: round trips, floors stored separately; clouds made of them in batches lie on the surfaces and are
-uniform by area."""
+"""Scenes packed in arrays: round trips, floors stored separately; clouds made of them are uniform by area."""
 
 import numpy as np
 import pytest
@@ -76,8 +75,7 @@ def seeded(seed: int = 0) -> torch.Generator:
 
 
 def some_scenes(n: int, k: int, seed: int = 0):
-    rng = np.random.default_rng(seed)
-    drawn = random_scenes(n, k, rng)
+    drawn = random_scenes(n, k, np.random.default_rng(seed))
     return PackedScenes(np.pad(drawn.kinds, [(0, 0), (1, 1)]), np.pad(drawn.params, [(0, 0), (1, 1), (0, 0)]))
 
 

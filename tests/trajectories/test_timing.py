@@ -306,8 +306,7 @@ def test_the_estimated_time_is_near_the_exact_one(seed: int, narrow: float) -> N
 
 
 def test_a_slow_torso_has_a_timing() -> None:
-    """Regression: at a corner where the torso turns back, the speed at a grid point was so high that only a
-    stop could follow, and no timing was found."""
+    """Regression: where the torso turns back, a speed was so high that only a stop could follow, and no timing was found."""
     fetch = (0.1, 1.25, 1.45, 1.57, 1.52, 1.57, 2.26, 2.26)
     robot = arm(fetch, tuple(4 * v for v in fetch))
     for seed in (1868, 2571, 2972):
@@ -380,8 +379,7 @@ def test_rows_of_a_motion_without_end_are_counted(jerk: float | None) -> None:
 
 @pytest.mark.parametrize("jerk", [2e3, 7.5e3, 1e5, 1e300])
 def test_rows_tell_the_acceleration_under_a_high_limit_of_jerk(jerk: float) -> None:
-    """Regression: the acceleration had its peak between two rows, so velocities and positions of the rows
-    disagreed and no motion was valid."""
+    """Regression: the peak of the acceleration was between two rows, whose velocities and positions then disagreed."""
     q = np.cumsum(np.random.default_rng(0).normal(0, 0.5, (5, 7)), axis=0)
     assert rates_agree(timed(q, settings=TimingSettings(jerk=jerk)))
 
@@ -409,8 +407,7 @@ def test_a_corner_in_a_narrow_passage_is_no_stop() -> None:
 
 @pytest.mark.parametrize("accepted", [6, 7, 8])
 def test_lower_accelerations_that_did_not_help_are_given_up(accepted: int) -> None:
-    """Regression: the lower accelerations were kept when the corners were tightened, and such motions took 2.8
-    times as long as with stops."""
+    """Regression: the lower accelerations were kept as corners were tightened: 2.8 times as long as with stops."""
     calls = []
 
     def valid(_motion: rd.Trajectory) -> bool:
@@ -430,8 +427,7 @@ def test_joints_without_a_jerk_limit_have_the_stated_default() -> None:
 
 
 def test_a_corner_that_its_neighbor_leaves_more_room_is_checked_again() -> None:
-    """Regression: the second corner was accepted beside a wide neighbor. When the neighbor shrank, the second
-    corner grew without a check and came too close to an obstacle."""
+    """Regression: the second corner grew without a check when its wide neighbor shrank, and came too near an obstacle."""
     q = np.tri(4, 7, -1)
 
     def keeps(corner: np.ndarray) -> bool:

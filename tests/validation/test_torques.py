@@ -57,8 +57,7 @@ def test_a_peak_between_two_times_is_found() -> None:
 
 
 def test_torques_are_those_of_the_cubics() -> None:
-    """Two rows at rest. The cubic has 12 rad/s² at both ends, independently of the accelerations that are written;
-    gravity alone needs 2.4 N m."""
+    """At rest, the cubic has 12 rad/s² at both ends, whatever accelerations are written; gravity alone needs 2.4 N m."""
     rows = np.array([[-0.25], [0.25]])
     still = np.zeros((2, 1))
     motion = rd.Trajectory(("hinge",), np.array([0.0, 0.5]), rows, still, still)

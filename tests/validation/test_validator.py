@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
+from helpers.panda import PANDA
 from helpers.refusals import refuses
 from helpers.sphere_oracles import random_shape
 from robotdiffuse.collision.exact_meshes import ExactCollision
@@ -323,8 +324,7 @@ def test_motions_begin_and_end_at_rest(end: int) -> None:
 
 @given(st.integers(0, 2**31), st.sampled_from([1e-4, 0.01, 0.05, 0.3]))
 def test_no_motion_within_the_limits_is_refused(seed: int, most: float) -> None:
-    """Full acceleration, coasting and braking in random order, from rest to rest, with rows at random times and
-    where the acceleration jumps, so that the cubics equal the motion."""
+    """Full acceleration, coasting and braking in random order; rows where it jumps make the cubics equal the motion."""
     rng = np.random.default_rng(seed)
     robot = box_arm()
     limit = robot.acceleration[0]
@@ -358,8 +358,7 @@ def test_micro_steps_hide_no_velocity(step: float, time: float) -> None:
 
 @pytest.mark.parametrize("back", [False, True])
 def test_micro_steps_hide_no_acceleration(back: bool) -> None:
-    """The motion keeps the velocity limit, but goes from rest to 1.9 rad/s at once; with `back`, it moves back
-    and forth within a millisecond."""
+    """The motion keeps the velocity limit, but is at 1.9 rad/s at once; with `back`, back and forth within 1 ms."""
     quick = in_micro_steps(1.9e-6, 1e-6, 0.01)
     if back:
         place = 1e-3 * np.abs((quick.times / 1e-3 + 0.5) % 1 - 0.5)
@@ -427,8 +426,7 @@ def between_rest(
 
 @pytest.mark.parametrize(("factor", "valid"), [(0.99, True), (1.03, False)])
 def test_rates_between_two_rows_are_those_of_the_cubic(factor: float, valid: bool) -> None:
-    """From rest to rest, the cubic reaches 1.5 times the mean velocity. Its acceleration at both ends is 6
-    times the mean velocity over the duration, with a mean of 0."""
+    """From rest to rest, the cubic reaches 1.5 times the mean velocity, and at its ends 6 times that over the duration."""
     robot = box_arm()
     report = verified(between_rest(SWING, [0.0, 1.5 * 1.2 / (factor * robot.velocity[0])]), robot=strong(1e3))
     assert report.valid if valid else refused(report, "velocity").subject == "j0"
@@ -455,8 +453,7 @@ def test_limits_hold_between_rows() -> None:
 
 @given(st.floats(0.0, 1e-3), st.floats(1e-4, 3e-3))
 def test_clearance_is_that_of_the_cubic(bulge: float, gap: float) -> None:
-    """Regression: the cubic comes nearer to a wall than the straight lines between the rows; 0.35 mm were
-    certified, but the arm was 0.29 mm inside the wall."""
+    """Regression: 0.35 mm were certified, but the cubic, unlike the lines between the rows, was 0.29 mm inside the wall."""
     rows = np.zeros((4, 3))
     v = np.zeros((4, 3))
     rows[0, 0] = rows[-1, 0] = -0.5
@@ -478,22 +475,20 @@ def test_clearance_is_that_of_the_cubic(bulge: float, gap: float) -> None:
 @pytest.mark.parametrize("count", [2, 3])
 def test_a_frame_keeps_its_speed_between_rows(factor: float, valid: bool, count: int) -> None:
     """The arm rests at the rows; between them the hand reaches 1.5 times its mean speed."""
-    panda = rd.load_robot("panda")
     start = np.array([0.0, 0.2, 0.0, -1.9, 0.0, 2.1, 0.785])
     rows = start + np.outer(np.linspace(0, 0.3, count), np.eye(7)[0])
-    motion = between_rest(rows, [0.0, 1.0, 2.0][:count], robot=panda)
-    speed = float(factor * 1.5 * np.linalg.norm(panda.fk(start, "panda_hand")[:2, 3]) * 0.3 / (count - 1))
+    motion = between_rest(rows, [0.0, 1.0, 2.0][:count], robot=PANDA)
+    speed = float(factor * 1.5 * np.linalg.norm(PANDA.fk(start, "panda_hand")[:2, 3]) * 0.3 / (count - 1))
     line = rd.CartesianLine("panda_hand", 0.1, None, speed)
-    report = rd.verify(rd.Problem(panda, rd.Scene(), rows[0], rows[-1], constraints=[line]), motion)
+    report = rd.verify(rd.Problem(PANDA, rd.Scene(), rows[0], rows[-1], constraints=[line]), motion)
     assert report.valid if valid else refused(report, "speed").subject == "panda_hand"
 
 
 def test_resampled_motions_keep_the_accelerations() -> None:
     """With few rows, the cubics overshoot where the acceleration jumps between rows."""
-    robot = rd.load_robot("panda")
     rows = np.array([[0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], [0.4, -0.5, 0.3, -2.0, 0.2, 1.8, 0.3]])
-    problem = rd.Problem(robot, rd.Scene(), rows[0], rd.JointGoal(rows[-1:]))
-    motion = time_parameterize(robot, rd.Path(robot.joint_names, rows), yes, yes).trajectory
+    problem = rd.Problem(PANDA, rd.Scene(), rows[0], rd.JointGoal(rows[-1:]))
+    motion = time_parameterize(PANDA, rd.Path(PANDA.joint_names, rows), yes, yes).trajectory
     for rate in (30, 50, 125, 250, 1000):
         fewer = motion.resample(rate)
         assert rd.verify(problem, fewer).valid
@@ -509,17 +504,15 @@ def test_the_line_of_a_violation_names_the_place_once() -> None:
 
 def test_eight_threads_validate_motions_of_one_problem() -> None:
     """Regression: threads shared objects of the proof that are not safe for threads."""
-    robot = rd.load_robot("panda")
     shapes = [
         rd.Box((0.5, 0.1, 0.4), (0.2, 0.2, 0.2)),
         rd.Cylinder((0.3, -0.5, 0.5), 0.1, 0.6),
         rd.Sphere((-0.3, 0.4, 0.6), 0.15),
     ]
     start = np.array([0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8])
-    problem = rd.Problem(robot=robot, scene=rd.Scene(shapes), start=start, goal=start)
-    rng = np.random.default_rng(0)
-    ends = start + rng.uniform(-0.1, 0.1, (64, 1, robot.dof)) * (robot.upper - robot.lower)
-    motions = [rd.Path(robot.joint_names, np.stack([start, end, start])) for end in ends[:, 0]]
+    problem = rd.Problem(robot=PANDA, scene=rd.Scene(shapes), start=start, goal=start)
+    ends = start + np.random.default_rng(0).uniform(-0.1, 0.1, (64, 1, PANDA.dof)) * (PANDA.upper - PANDA.lower)
+    motions = [rd.Path(PANDA.joint_names, np.stack([start, end, start])) for end in ends[:, 0]]
 
     def validated(motion: rd.Path) -> Report:
         return rd.verify(problem, motion)

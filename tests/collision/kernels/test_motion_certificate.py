@@ -70,8 +70,7 @@ robots = st.sampled_from(list(LINKS))
 
 @given(robots, seeds)
 def test_planes_part_as_far_as_coal_says(name: str, seed: int) -> None:
-    """The separating plane found from any initial guess has Coal's distance, within the 2 % at which the search
-    ends."""
+    """From any first guess, the separating plane has Coal's distance within the 2 % at which the search ends."""
     rng = np.random.default_rng(seed)
     robot = clad_arm(name)
     scene = scene_of(rng, False)
@@ -97,8 +96,7 @@ def test_planes_part_as_far_as_coal_says(name: str, seed: int) -> None:
 
 @given(robots, seeds, st.booleans())
 def test_the_certificate_of_curved_motions(name: str, seed: int, cloud: bool) -> None:
-    """Some links have several convex parts. Regression: bounds were taken from the first part, so pieces in
-    which another part collides were certified."""
+    """Regression: bounds were taken from the first convex part, so pieces in which another part collides were certified."""
     rng = np.random.default_rng(seed)
     robot = clad_arm(name)
     scene = scene_of(rng, cloud)

@@ -21,9 +21,8 @@ def _look_up(table, index, bit, out):
 
 
 def test_gathered_bits() -> None:
-    rng = np.random.default_rng(1)
     table = np.arange(100, dtype=np.float32)
-    index = rng.integers(0, 100, (1, W)).astype(np.float32)
+    index = np.random.default_rng(1).integers(0, 100, (1, W)).astype(np.float32)
     out = np.zeros((1, W), np.float32)
     total = _look_up(table, index, np.int32(4), out)
     np.testing.assert_array_equal(out, index)

@@ -26,8 +26,7 @@ def arm(monkeypatch):
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory):
-    """Two shards of motions that bend towards the side of the obstacle, which is too far away to change
-    clearances; and an encoder."""
+    """Motions that bend towards the side of the obstacle, which is too far away to change clearances; and an encoder."""
     home = tmp_path_factory.mktemp("stored")
     arm = box_arm()
     rng = np.random.default_rng(0)

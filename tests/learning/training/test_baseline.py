@@ -10,6 +10,8 @@ import torch
 from torch import Tensor, nn
 
 import robotdiffuse as rd
+from helpers.panda import PANDA
+from helpers.refusals import refuses
 from helpers.stores import random_motions, write_motions
 from robotdiffuse.cli import main
 from robotdiffuse.core.registry import Entry
@@ -41,8 +43,7 @@ class Reversal(BaselineNetwork):
 @pytest.fixture
 def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     monkeypatch.setitem(NETWORKS, "reversal", Entry(f"{__name__}:Reversal", "for tests", "ReversalSettings"))
-    robot = rd.load_robot("panda")
-    write_motions(tmp_path / "data", robot, random_motions(robot, 40))
+    write_motions(tmp_path / "data", PANDA, random_motions(PANDA, 40))
     return str(tmp_path / "data")
 
 
@@ -54,16 +55,14 @@ def test_training_learns(data: str, tmp_path: Path) -> None:
 
 
 def test_weights_of_another_robot_or_none_are_refused(data: str, tmp_path: Path) -> None:
-    panda = rd.load_robot("panda")
     with pytest.raises(rd.InputError, match="no weights of the network reversal come with the package for panda; train them"):
-        load_network("reversal", None, panda)
+        load_network("reversal", None, PANDA)
     with pytest.raises(rd.InputError, match="holds no reversal; train them: robotdiffuse train baseline reversal"):
-        load_network("reversal", str(tmp_path), panda)
+        load_network("reversal", str(tmp_path), PANDA)
     settings = baseline_training("reversal", {"data": data, "samples": 160})
     train_baseline(settings, str(tmp_path / "out"))
-    narrow = panda.with_locked({"panda_joint7": 0.0})
-    with pytest.raises(rd.InputError, match="was trained for panda with joints"):
-        load_network("reversal", str(tmp_path / "out"), narrow)
+    narrow = PANDA.with_locked({"panda_joint7": 0.0})
+    refuses("was trained for panda with joints", load_network, "reversal", str(tmp_path / "out"), narrow)
 
 
 def test_command(data: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -78,9 +77,8 @@ def test_command(data: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -
 
 @pytest.mark.parametrize("name", sorted(NETWORKS.keys() - {"completion"}))
 def test_every_network_normalizes_by_the_joint_limits(name: str) -> None:
-    panda = rd.load_robot("panda")
-    network = NETWORKS.load(name)(RobotIdentity.of(panda), NETWORKS.defaults(name))
-    ends = np.stack([panda.lower, panda.upper])
+    network = NETWORKS.load(name)(RobotIdentity.of(PANDA), NETWORKS.defaults(name))
+    ends = np.stack([PANDA.lower, PANDA.upper])
     np.testing.assert_allclose(network.normalizer.to_unit(ends), [[-1] * 7, [1] * 7])
     given = torch.from_numpy(ends)
     torch.testing.assert_close(network.from_unit(network.to_unit(given)), given)

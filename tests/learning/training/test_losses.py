@@ -17,8 +17,7 @@ DOUBLE = losses.ForwardKinematics(PANDA, torch.float64)
 
 
 def configurations(n: int, waypoints: int, seed: int = 0) -> torch.Tensor:
-    q = np.random.default_rng(seed).uniform(PANDA.lower, PANDA.upper, (n, waypoints, 7))
-    return torch.from_numpy(q)
+    return torch.from_numpy(np.random.default_rng(seed).uniform(PANDA.lower, PANDA.upper, (n, waypoints, 7)))
 
 
 @pytest.mark.parametrize("floor", [True, False])

@@ -49,8 +49,7 @@ def planner_settings(data, **changes) -> PlannerTraining:
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_export")
 def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
-    """A step of two processes equals one on both batches together. The processes resume together, and skip bad
-    steps together."""
+    """A step of two processes equals one on both batches together; they resume and skip bad steps together."""
     out = tmp_path / "two"
     settings = planner_settings(data, samples=160, gradient_norm=1e6, device="cpu")
     file = tmp_path / "two.json"
@@ -191,8 +190,7 @@ def test_every_choice_trains_and_plans(changes, tmp_path, data, arm, monkeypatch
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
 def test_errors_in_the_workspace_have_the_same_weight_for_every_objective(data, arm, objective):
-    """With the weight of the output's error, the loss would be 10,000 times too large for noise at the last
-    level."""
+    """With the weight of the output's error, the loss would be 10,000 times too large for noise at the last level."""
     encoder = load_encoder(data.parent / "encoder")
     loaded = load_data(str(data), arm, None, WAYPOINTS, print)
     settings = planner_settings(data, objective=objective)

@@ -126,8 +126,7 @@ def test_the_guidance_scale_reaches_the_network() -> None:
 
 
 def test_locked_joints_that_the_network_does_not_know_keep_the_weights() -> None:
-    """Fingers may be locked at another opening. A locked joint of the arm would change the number of the
-    network's joints."""
+    """Fingers may be locked elsewhere; a locked joint of the arm would change the number of the network's joints."""
     for opening in (0.0, 0.065):
         robot = rd.load_robot("panda", locked={"panda_finger_joint1": opening})
         assert weights_for("model", robot) is not None and Diffusion().network(robot) is not None

@@ -97,8 +97,7 @@ def test_other_requests_hold_among_moving_obstacles(asked: str) -> None:
 
 
 def test_a_stop_at_a_waypoint_is_not_gone_through() -> None:
-    """The waypoint is on the straight line, so the motion would not stop by itself; a ball is at the waypoint
-    first."""
+    """The waypoint is on the straight line, so the motion would not stop by itself; a ball is at the waypoint first."""
     middle = (START + GOAL) / 2
     at = PANDA.fk(middle, "panda_hand")[:3, 3]
     ball = rd.MovingObstacle(rd.Sphere(at, 0.08, name="ball"), velocity=[0.3, 0, 0.3])
@@ -111,8 +110,7 @@ def test_a_stop_at_a_waypoint_is_not_gone_through() -> None:
 
 
 def test_corners_are_rounded_as_far_as_the_planner_certified() -> None:
-    """If no rounding is allowed, the motion stops at the corner; if little is allowed, it passes more slowly
-    than by default."""
+    """Without rounding, the motion stops at the corner; with little, it passes more slowly than by default."""
     middle = np.array([0.0, 0.9, 0, -1.8, 0, 2.1, 0.8])
     path = rd.Path(PANDA.joint_names, np.stack([START, middle, GOAL]))
     shortest = []

@@ -56,8 +56,7 @@ def test_solved_means_free_of_what_was_seen(planner: Planner, unknown: str) -> N
 
 
 def test_predicted_obstacles_are_kept_clear_of(planner: Planner, tmp_path: Path) -> None:
-    """With only the seen points, the path leads through the back of the box; with predicted voxels, it avoids
-    the box."""
+    """By the seen points alone, the path leads through the back of the box; with predicted voxels, around it."""
     truth = rd.Problem(PANDA, DEEP, START, GOAL)
     true = voxels_within(DEEP, FINE).astype(np.float32)
     through = planner.plan(partial("optimistic"), time_limit=2.0)
@@ -178,8 +177,7 @@ def test_a_fallback_to_another_assumption_is_a_note(planner: Planner) -> None:
 
 
 def test_confidence_falls_with_what_rays_do_not_tell(planner: Planner) -> None:
-    """Regression: with half of an image lost, the stated confidence was 0.88, but 28 % of the motions were
-    free."""
+    """Regression: with half of an image lost, the stated confidence was 0.88, but 28 % of the motions were free."""
     view = taken(rd.Scene([FLOOR]))
     lost = view.depth.copy()
     lost[:, :100] = 0.0

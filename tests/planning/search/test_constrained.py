@@ -99,8 +99,7 @@ def test_speed_of_a_line_is_kept_and_used() -> None:
 
 
 def test_validator_names_constraint_amount_and_place() -> None:
-    """The straight line in joint space turns the base joint, so the hand is off by 103 mm in the middle of the
-    line."""
+    """The straight line in joint space turns the base joint, so the hand is off by 103 mm in the middle of the line."""
     straight = rd.Path(PANDA.joint_names, np.stack([START, GOAL]))
     found = rd.verify(problem([LINE]), straight).violation
     assert (found.kind, found.subject, found.other) == ("constraint", HAND, LINE.kind)

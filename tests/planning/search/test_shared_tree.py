@@ -131,10 +131,8 @@ def test_nearest_nodes_are_those_of_brute_force(count: int, dof: int, most: int,
 
 
 def test_samples_fill_the_hyperspheroid_evenly() -> None:
-    """Every sample can lie on a shorter path, and the fraction of samples in a smaller spheroid is that of its
-    volume."""
-    rng = np.random.default_rng(0)
-    a, b = rng.normal(size=(2, 4)).astype(np.float32)
+    """Every sample can lie on a shorter path; the share of samples in a smaller spheroid is that of its volume."""
+    a, b = np.random.default_rng(0).normal(size=(2, 4)).astype(np.float32)
     wide = np.full(4, 100, np.float32)
     space = search_space(CollisionChecker(PANDA, WALL), 0.04)._replace(lower=-wide, upper=wide)
     gap = np.float32(np.linalg.norm(b - a))

@@ -49,8 +49,7 @@ def test_spheres_cover_and_hardly_stick_out(name: str) -> None:
     assert gaps(surface_samples(meshes, 20_000, 1), spheres).max() <= 1e-9
     assert stick_out(solid, spheres).max() <= TOLERANCE + solid.spacing
     # independent check: points on the spheres against the solid
-    rng = np.random.default_rng(2)
-    unit = rng.normal(size=(200, 3))
+    unit = np.random.default_rng(2).normal(size=(200, 3))
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     outer = (spheres[:, None, :3] + spheres[:, None, 3:] * unit).reshape(-1, 3)
     hulls = [trimesh.Trimesh(mesh.vertices, mesh.faces, process=False) for mesh in meshes]

@@ -41,8 +41,7 @@ def test_awkward_arms_are_prepared_and_plan(name: str, tmp_path: Path) -> None:
         report = add_robot(make(tmp_path), out=tmp_path / "robot", settings=QUICK)
     made = report.robot
     assert made.dof == dof and all(part.covered for part in report.links)
-    rng = np.random.default_rng(0)
-    q = rng.uniform(made.lower, made.upper, (2000, dof))
+    q = np.random.default_rng(0).uniform(made.lower, made.upper, (2000, dof))
     q = q[CollisionChecker(made, rd.Scene()).free(q)]
     near = q[0] + np.array([[0.1], [0.03], [0.01], [0.001]]) * ((made.lower + made.upper) / 2 - q[0])
     problem = rd.Problem(made, rd.Scene(), q[0], near[CollisionChecker(made, rd.Scene()).free(near)][0])
@@ -89,8 +88,7 @@ def test_an_arm_that_is_never_free_is_refused_with_the_pair_to_allow(tmp_path: P
 
 
 def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:
-    """Regression: goals of Fetch and Baxter were in false collision, since the arm touches convex parts of the
-    torso, but not the torso."""
+    """Regression: goals of Fetch and Baxter collided, since the arm touches convex parts of the torso, but not the torso."""
     trough = boxes(
         ((-0.3, -0.2, 0), (0.3, 0.2, 0.05)), ((0.25, -0.2, 0.05), (0.3, 0.2, 0.4)), ((-0.3, -0.2, 0.05), (-0.25, 0.2, 0.4))
     )

@@ -90,8 +90,7 @@ def test_frames_are_those_of_mujoco(file: Path) -> None:
     robot = UrdfTree(file, {}).robot(tip="wrist")
     model = mujoco.MjModel.from_xml_path(str(file))
     assert robot.joint_names == ("j1", "lift", "j2", "j3")
-    rng = np.random.default_rng(0)
-    for q in rng.uniform(robot.lower, robot.upper, (50, robot.dof)):
+    for q in np.random.default_rng(0).uniform(robot.lower, robot.upper, (50, robot.dof)):
         data = state_of(model, robot, q)
         bodies = ("base", "shoulder", "elbow", "wrist", "left_finger", "right_finger")
         found = [(data.body(name).xpos, data.body(name).xmat, name) for name in bodies]
@@ -114,13 +113,11 @@ def test_limits_poses_and_mimics_are_those_of_the_model(file: Path) -> None:
 
 
 def test_self_collisions_are_those_of_mujoco(file: Path, arm: rd.Robot) -> None:
-    """On contacts deeper than 1 mm, MuJoCo and the validator's meshes agree. Pairs that the model excludes are
-    not checked."""
+    """MuJoCo and the validator's meshes agree on contacts deeper than 1 mm; pairs that the model excludes are free."""
     model = mujoco.MjModel.from_xml_path(str(file))
     checker = CollisionChecker(arm, rd.Scene())
-    rng = np.random.default_rng(1)
     collisions = 0
-    for q in rng.uniform(arm.lower, arm.upper, (200, arm.dof)):
+    for q in np.random.default_rng(1).uniform(arm.lower, arm.upper, (200, arm.dof)):
         data = state_of(model, arm, q)
         bodies = [
             {model.body(model.geom_bodyid[geom]).name for geom in contact.geom}

@@ -252,8 +252,7 @@ def test_a_mesh_without_volume_is_noted(tmp_path: Path) -> None:
 
 
 def test_preparations_of_one_urdf_that_differ_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Regression: the first robot in alphabetical order was used, and a motion through the arm itself was
-    called valid."""
+    """Regression: the first robot by alphabet was used, and a motion through the arm itself was called valid."""
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
     file = written(tmp_path, chain("base", row("j", 3)))
     with coarse_grids():
@@ -459,8 +458,7 @@ def test_xacro_that_cannot_be_compiled_says_what_helps(tmp_path: Path, monkeypat
 
 
 def test_only_robot_add_compiles_xacro(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Regression: a problem, a result or a certificate that names a URDF ran the code in the URDF's
-    expressions."""
+    """Regression: a problem, result or certificate that names a URDF ran the code in the URDF's expressions."""
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
     namespace = "http://www.ros.org/wiki/xacro"
     property_ = f'<x:property xmlns:x="{namespace}" name="a" value="1"/>'

@@ -17,8 +17,7 @@ from robotdiffuse.visualization.live.server import free_port, may_connect
 
 
 def test_viser_is_silent_and_other_threads_print(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Regression: while viser started or stopped, sys.stdout was replaced for all threads, and the output of
-    other threads was lost."""
+    """Regression: while viser started or stopped, sys.stdout was replaced for all threads, and their output was lost."""
     during = []
     for name in ("__init__", "stop"):
         own = getattr(viser.ViserServer, name)
