@@ -85,10 +85,9 @@ BAD_CALL = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", BAD_CALL)
-def test_bad_call_is_status_2_in_one_line(case: str, tmp_path: Path, said: Said) -> None:
+@pytest.mark.parametrize(("argv", "named"), BAD_CALL.values(), ids=BAD_CALL)
+def test_bad_call_is_status_2_in_one_line(argv: list[str], named: str, tmp_path: Path, said: Said) -> None:
     write_problem(tmp_path)
-    argv, named = BAD_CALL[case]
     error = said(2, *argv)
     assert "error: " in error and named in error and error.count("\n") == 1
     assert [file.name for file in tmp_path.iterdir()] == ["problem.json"]

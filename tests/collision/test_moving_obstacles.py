@@ -128,7 +128,7 @@ def test_motions_that_are_none() -> None:
         ({"times": [0.0, 1.0], "poses": [STANDS, 2 * STANDS]}, r"sphere.poses\[1\] is .*must be a rotation"),
     ):
         refuses(message, rd.MovingObstacle, BALL, **motion)
-        refuses("point_cloud", rd.MovingObstacle, rd.PointCloud([[0.5, 0, 0.5]]), velocity=[0, 1, 0])
+    refuses("point_cloud", rd.MovingObstacle, rd.PointCloud([[0.5, 0, 0.5]]), velocity=[0, 1, 0])
 
 
 @pytest.mark.parametrize("base", [None, transform(np.array([0, 0, 0.7]), rotation_about(AXIS, 0.5))])
@@ -153,6 +153,7 @@ SPHERE = {"sphere": {"center": [0, 0, 1], "radius": 0.1}}
 
 
 def test_files_name_the_field() -> None:
+    record = problem_record(rd.Problem(PANDA, rd.Scene(), START, END))
     for entry, message in (
         ({}, r"moving is .*; it must be a list"),
         ([3], r"moving\[0\] is 3; it must be a shape and its motion"),
@@ -160,7 +161,6 @@ def test_files_name_the_field() -> None:
         ([SPHERE], r"moving\[0\]: .* has no motion"),
         ([{"sphere": {"center": [0, 0, 1], "radius": -1}, "max_speed": 1}], r"moving\[0\].*radius"),
     ):
-        record = problem_record(rd.Problem(PANDA, rd.Scene(), START, END))
         refuses(message, problem_from_record, record | {"moving": entry})
 
 

@@ -20,28 +20,23 @@ FAR = [1e20, 0, 0]
 
 
 def test_numbers_out_of_bounds() -> None:
-    for make, message in (
-        (lambda: rd.Sphere([0, 0, 0], 1e7), "sphere.radius is 10000000.0; it must be a number from 1e-09"),
-        (lambda: rd.Sphere([0, 0, 0], 1e-300), "sphere.radius is 1e-300"),
-        (lambda: rd.Sphere(FAR, 1), r"sphere.center is \[1e\+20, 0, 0\]; it must be 3 finite numbers within ±10000"),
-        (lambda: rd.Box([0, 0, 0], [1, 1, 1e-30]), "box.size .* at least 1e-09 m"),
-        (lambda: rd.Box([0, 0, 0], [1, 1, 1], [1e200, 1e200, 0, 0]), "box.wxyz .* within ±10000"),
-        (lambda: rd.Mesh([*TRIANGLE, [5e37, 0, 0]], [[0, 1, 2]]), r"mesh.vertices\[3\] is .* within ±10000"),
-        (lambda: rd.Mesh(TRIANGLE, [[0, 1, np.nan]]), "mesh.faces"),
-        (lambda: rd.PointCloud([[0, 0, 0], [1e39, 0, 0], [0, 1e39, 0]]), r"points\[1\] is"),
-        (lambda: rd.PoseGoal("l3", transform(np.array(FAR))), "goal.T_base_frame .* within ±10000"),
-        (lambda: rd.DepthView([[1.0]], (1, 1, 0, 0), transform(np.array(FAR))), "view.T_base_camera"),
-        (
-            lambda: rd.load_robot("panda").with_locked({"panda_finger_joint1": 0.2}),
-            "locked: panda_finger_joint1 is 0.2; it is far beyond its limits, 0 to 0.04",
-        ),
-        (lambda: box_arm().with_locked({"j0": 1e20}), r"locked: j0 is 1e\+20; it must be a number within"),
-        (lambda: rd.Problem(box_arm(), rd.Scene(), [1e20, 0, 0], [0, 0, 0]), "start: j0"),
-        (lambda: rd.Sphere([False, 0.5, 0], 1), r"sphere.center is \[False, 0.5, 0\]; it must be 3 finite"),
-        (lambda: rd.PointCloud([[0, 0, 1], [0, True, 0]]), r"points is \[\[.*; it must be n x 3"),
-        (lambda: rd.Problem(box_arm(), rd.Scene(), [0, 0, 0], [0, 0, 0], clearance=1e39), "clearance"),
-    ):
-        refuses(message, make)
+    refuses("sphere.radius is 10000000.0; it must be a number from 1e-09", rd.Sphere, [0, 0, 0], 1e7)
+    refuses("sphere.radius is 1e-300", rd.Sphere, [0, 0, 0], 1e-300)
+    refuses(r"sphere.center is \[1e\+20, 0, 0\]; it must be 3 finite numbers within ±10000", rd.Sphere, FAR, 1)
+    refuses("box.size .* at least 1e-09 m", rd.Box, [0, 0, 0], [1, 1, 1e-30])
+    refuses("box.wxyz .* within ±10000", rd.Box, [0, 0, 0], [1, 1, 1], [1e200, 1e200, 0, 0])
+    refuses(r"mesh.vertices\[3\] is .* within ±10000", rd.Mesh, [*TRIANGLE, [5e37, 0, 0]], [[0, 1, 2]])
+    refuses("mesh.faces", rd.Mesh, TRIANGLE, [[0, 1, np.nan]])
+    refuses(r"points\[1\] is", rd.PointCloud, [[0, 0, 0], [1e39, 0, 0], [0, 1e39, 0]])
+    refuses("goal.T_base_frame .* within ±10000", rd.PoseGoal, "l3", transform(np.array(FAR)))
+    refuses("view.T_base_camera", rd.DepthView, [[1.0]], (1, 1, 0, 0), transform(np.array(FAR)))
+    far = {"panda_finger_joint1": 0.2}
+    refuses("locked: panda_finger_joint1 is 0.2; it is far beyond its limits, 0 to 0.04", rd.load_robot, "panda", locked=far)
+    refuses(r"locked: j0 is 1e\+20; it must be a number within", box_arm().with_locked, {"j0": 1e20})
+    refuses("start: j0", rd.Problem, box_arm(), rd.Scene(), [1e20, 0, 0], [0, 0, 0])
+    refuses(r"sphere.center is \[False, 0.5, 0\]; it must be 3 finite", rd.Sphere, [False, 0.5, 0], 1)
+    refuses(r"points is \[\[.*; it must be n x 3", rd.PointCloud, [[0, 0, 1], [0, True, 0]])
+    refuses("clearance", rd.Problem, box_arm(), rd.Scene(), [0, 0, 0], [0, 0, 0], clearance=1e39)
 
 
 @pytest.mark.parametrize("distance", [10.0, 1e3, 9e3])
@@ -98,13 +93,10 @@ def test_a_pose_by_quaternion_and_by_rpy_is_scipys() -> None:
 
 
 def test_wrong_poses_are_refused() -> None:
-    for fields, message in (
-        ({"wxyz": [1, 0, 0, 0], "rpy": [0, 0, 0]}, "pose has wxyz and rpy; give one of them"),
-        ({"rpy": [0, 0]}, r"pose.rpy \[rad\] is \[0, 0\]; it must be 3 finite numbers"),
-        ({"wxyz": [0, 0, 0, 0]}, "a quaternion must not be zero"),
-        ({"xyz": [0, 0, np.nan]}, "pose.xyz is .*; it must be 3 finite numbers"),
-    ):
-        refuses(message, rd.pose, **{"xyz": [0, 0, 0]} | fields)
+    refuses("pose has wxyz and rpy; give one of them", rd.pose, [0, 0, 0], wxyz=[1, 0, 0, 0], rpy=[0, 0, 0])
+    refuses(r"pose.rpy \[rad\] is \[0, 0\]; it must be 3 finite numbers", rd.pose, [0, 0, 0], rpy=[0, 0])
+    refuses("a quaternion must not be zero", rd.pose, [0, 0, 0], wxyz=[0, 0, 0, 0])
+    refuses("pose.xyz is .*; it must be 3 finite numbers", rd.pose, [0, 0, np.nan])
 
 
 CALLS = """

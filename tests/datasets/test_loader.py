@@ -126,12 +126,9 @@ def test_resampling():
 
 
 def test_bad_input(store, tmp_path):
-    for arguments, message in [
-        ({"split": "tests"}, "unknown split 'tests'; known: test, train, validation"),
-        ({"points": 0}, "points is 0; it must be at least 1"),
-        ({"robot": replace(ARM, spheres={})}, "use the robot of the data"),
-    ]:
-        refuses(message, RopDataset, store, **arguments)
+    refuses("unknown split 'tests'; known: test, train, validation", RopDataset, store, split="tests")
+    refuses("points is 0; it must be at least 1", RopDataset, store, points=0)
+    refuses("use the robot of the data", RopDataset, store, robot=replace(ARM, spheres={}))
     assert len(RopDataset(store, robot=ARM)) > 0
     refuses("batch_size is 0", RopDataset(store).batches, 0)
 

@@ -68,9 +68,8 @@ UNSOUND = {
 
 
 @pytest.mark.sim
-@pytest.mark.parametrize("case", UNSOUND)
-def test_unsound_motions_are_found(case, tmp_path, pybullet):
-    scene, q, kinds = UNSOUND[case]
+@pytest.mark.parametrize(("scene", "q", "kinds"), UNSOUND.values(), ids=UNSOUND)
+def test_unsound_motions_are_found(scene, q, kinds, tmp_path, pybullet):
     write_motions(tmp_path, ARM, [record(ARM, scene, q)], waypoints=len(q))
     assert found(tmp_path) == kinds
 
@@ -100,9 +99,8 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_what_is_recorded_wrongly_is_found(case, tmp_path):
-    kind, spoil = WRONG[case]
+@pytest.mark.parametrize(("kind", "spoil"), WRONG.values(), ids=WRONG)
+def test_what_is_recorded_wrongly_is_found(kind, spoil, tmp_path):
     near = record(ARM, rd.Scene([rd.Sphere([0.0, 1.5, 0.0], 0.1)]), line(AWAY, np.array([1.0, 0.0, 0.0])))
     write_motions(tmp_path, ARM, [*right(2), spoil(near)])
     assert found(tmp_path, pybullet=False) == {kind: 1}

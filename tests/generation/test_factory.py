@@ -187,18 +187,15 @@ def test_frames_in_time_keep_the_velocity_limits() -> None:
 
 
 def test_bad_settings_are_refused() -> None:
-    for change, message in (
-        ({"trajectories": 0}, "trajectories is 0"),
-        ({"trivial_share": float("nan")}, "trivial_share is nan"),
-        ({"target": "posse"}, "target.*posse.*pose, position"),
-        ({"mix": {}}, "mix is empty"),
-        ({"mix": {"rop": float("nan")}}, "share of rop is nan"),
-        ({"mix": {"pantry": 1.0}}, r"pantry.*rop, rop_dense"),
-        ({"planner": "aorrtc"}, "planner is aorrtc, but its settings are SharedTreeSettings"),
-        ({"planner": "bi_rrt"}, r"planner 'bi_rrt'; known: aorrtc, shared_tree_rrt_star"),
-    ):
-        refuses(message, replace, SETTINGS, **change)
-        assert GenerationSettings.from_json(AORRTC.to_json(), "settings") == AORRTC
+    refuses("trajectories is 0", replace, SETTINGS, trajectories=0)
+    refuses("trivial_share is nan", replace, SETTINGS, trivial_share=float("nan"))
+    refuses("target.*posse.*pose, position", replace, SETTINGS, target="posse")
+    refuses("mix is empty", replace, SETTINGS, mix={})
+    refuses("share of rop is nan", replace, SETTINGS, mix={"rop": float("nan")})
+    refuses(r"pantry.*rop, rop_dense", replace, SETTINGS, mix={"pantry": 1.0})
+    refuses("planner is aorrtc, but its settings are SharedTreeSettings", replace, SETTINGS, planner="aorrtc")
+    refuses(r"planner 'bi_rrt'; known: aorrtc, shared_tree_rrt_star", replace, SETTINGS, planner="bi_rrt")
+    assert GenerationSettings.from_json(AORRTC.to_json(), "settings") == AORRTC
 
 
 def test_other_settings_are_refused_by_name(folder: Path) -> None:

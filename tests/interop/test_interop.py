@@ -288,9 +288,8 @@ REFUSED: dict[str, tuple[Callable[..., object], tuple[Any, ...], str]] = {
 }
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_bad_motions_are_refused_in_one_line(name: str) -> None:
-    read, given, wanted = REFUSED[name]
+@pytest.mark.parametrize(("read", "given", "wanted"), REFUSED.values(), ids=REFUSED)
+def test_bad_motions_are_refused_in_one_line(read: Callable[..., object], given: tuple[Any, ...], wanted: str) -> None:
     refuses(wanted, read, *given)
 
 

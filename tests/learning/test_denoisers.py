@@ -124,14 +124,11 @@ def test_unet_pads_and_crops():
 
 
 def test_bad_settings():
-    for kind, values, message in (
-        (denoisers.TransformerSettings, {"width": 30, "heads": 4}, "transformer.heads is 4"),
-        (denoisers.TransformerSettings, {"width": 15, "heads": 5}, "transformer.width is 15"),
-        (denoisers.UNetSettings, {"kernel": 4}, "unet.kernel is 4"),
-        (denoisers.UNetSettings, {"width": 7}, "unet.width is 7"),
-        (denoiser, {"name": "decoder_only", "settings": UNEVEN}, r"decoder_only\.patch is 5; it must divide the 12 waypoints"),
-    ):
-        refuses(message, kind, **values)
+    refuses("transformer.heads is 4", denoisers.TransformerSettings, width=30, heads=4)
+    refuses("transformer.width is 15", denoisers.TransformerSettings, width=15, heads=5)
+    refuses("unet.kernel is 4", denoisers.UNetSettings, kernel=4)
+    refuses("unet.width is 7", denoisers.UNetSettings, width=7)
+    refuses(r"decoder_only\.patch is 5; it must divide the 12 waypoints", denoiser, name="decoder_only", settings=UNEVEN)
 
 
 def encoder_for(name: str) -> str:

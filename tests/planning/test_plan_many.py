@@ -58,13 +58,10 @@ def test_a_process_that_dies_costs_one_problem(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_arguments_are_checked_at_once() -> None:
-    for arguments, message in (
-        ({"workers": 0}, "workers is 0"),
-        ({"planner": "rrt"}, "unknown planner 'rrt'"),
-        ({"time": 1.0}, "unknown argument 'time'; known: .*time_limit"),
-        ({"until": "soon"}, "unknown until .soon."),
-    ):
-        refuses(message, rd.plan_many, problems()[:1], **arguments)
+    refuses("workers is 0", rd.plan_many, problems()[:1], workers=0)
+    refuses("unknown planner 'rrt'", rd.plan_many, problems()[:1], planner="rrt")
+    refuses("unknown argument 'time'; known: .*time_limit", rd.plan_many, problems()[:1], time=1.0)
+    refuses("unknown until .soon.", rd.plan_many, problems()[:1], until="soon")
 
 
 PLANS = """

@@ -1,7 +1,6 @@
 """Properties of every planner in the table: solved means verified, anything else comes with a reason."""
 
 import inspect
-import re
 import traceback
 from dataclasses import fields, replace
 
@@ -72,15 +71,9 @@ def test_plan_with_a_planner_and_settings_by_name() -> None:
     assert first.solved and first.planner == "aorrtc"
     nested = rd.load_planner("diffusion", {"guidance": {"margin": 0.03}, "guidance.self_margin": 0.02})
     assert (nested.settings.guidance.margin, nested.settings.guidance.self_margin) == (0.03, 0.02)  # type: ignore[attr-defined]
-    for wrong, message in (
-        (
-            {"planner": "aorrtc", "settings": {"rang": 1}},
-            "patience=16000; did you mean range?",
-        ),
-        ({"planner": "aorrtc", "settings": {"range": -1.0}}, "aorrtc.range is -1.0"),
-        ({"planner": "aorrtc", "settings": "range=1"}, "settings is 'range=1'; it must be a table"),
-    ):
-        refuses(re.escape(message), rd.plan, problem, **wrong)
+    refuses(r"patience=16000; did you mean range\?", rd.plan, problem, planner="aorrtc", settings={"rang": 1})
+    refuses(r"aorrtc\.range is -1\.0", rd.plan, problem, planner="aorrtc", settings={"range": -1.0})
+    refuses("settings is 'range=1'; it must be a table", rd.plan, problem, planner="aorrtc", settings="range=1")
 
 
 def test_the_default_planner_is_aorrtc_and_needs_no_weights() -> None:

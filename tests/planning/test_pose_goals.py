@@ -138,14 +138,11 @@ def asked(*links: str) -> rd.Problem:
 
 
 def test_what_makes_no_sense_is_one_line() -> None:
-    for make, message in (
-        (lambda: rd.PosesGoal([rd.PoseGoal("a", np.eye(4))] * 2), "goal.poses names 'a' twice"),
-        (lambda: rd.PosesGoal([]), r"goal.poses is \[\]; it must be a list of rd.PoseGoal"),
-        (lambda: asked("left_gripper", "middle"), "unknown link in goal.poses: 'middle'"),
-        (lambda: asked("left_gripper", "torso"), "goal.poses: no planned joint moves 'torso'"),
-        (lambda: asked("left_gripper", "left_gripper_base_link"), "one rigid part; give the pose of one"),
-    ):
-        refuses(message, make)
+    refuses("goal.poses names 'a' twice", rd.PosesGoal, [rd.PoseGoal("a", np.eye(4))] * 2)
+    refuses(r"goal.poses is \[\]; it must be a list of rd.PoseGoal", rd.PosesGoal, [])
+    refuses("unknown link in goal.poses: 'middle'", asked, "left_gripper", "middle")
+    refuses("goal.poses: no planned joint moves 'torso'", asked, "left_gripper", "torso")
+    refuses("one rigid part; give the pose of one", asked, "left_gripper", "left_gripper_base_link")
 
 
 ARMS = ("iiwa14", "gen3", "panda", "ur5e")

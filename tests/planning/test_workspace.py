@@ -129,29 +129,27 @@ def test_short_lines_and_turns_about_the_tool_point(way: float, turn: float, ang
 
 
 def test_bad_input() -> None:
-    for call, message in (
-        (lambda space: space.plan_line([np.eye(4)] * 2, "ready"), "pose is 2 poses; a line has one end"),
-        (lambda space: space.move("bal", np.eye(4)), "unknown obstacle 'bal'; known: ball"),
-        (lambda space: space.move("ball", np.eye(3)), "T_world_shape is .*; it must be 4 x 4"),
-        (lambda space: space.attach("cup", HOME), "unknown obstacle 'cup'"),
-        (lambda space: space.add(*[rd.Sphere([1, 0, 0], 0.1, name="a")] * 2), "names must differ"),
-        (lambda space: space.plan(HOME, HOME[:3]), "start has 3 values; panda has 7 planned joints"),
-        (lambda space: rd.Workspace(space.robot, tip="nose"), "unknown link 'nose'"),
-        (lambda space: space.plan_steps([rd.MoveTo("redy")], "ready"), "step 1 of 1, move to: .*'redy'"),
-        (
-            lambda space: space.plan_steps([rd.Attach("cup", name="grasp")], "ready"),
-            "step 1 of 1, grasp: unknown obstacle 'cup'; known: ball",
-        ),
-        (
-            lambda space: space.plan_steps([rd.MoveTo("ready", contacts={"cup": "all"}, name="go")], "ready"),
-            "step 1 of 1, go: unknown obstacle in",
-        ),
-        (lambda _: rd.MoveRelative([0, 0, 0.1], "base"), "frame is 'base'; it must be 'tip' or 'world'"),
-        (lambda _: rd.MoveRelative([0, 0.1]), r"xyz is .*; it must be 3 finite numbers"),
-    ):
-        space = panda()
-        space.add(rd.Sphere([0.5, 0.0, 0.6], 0.2, name="ball"))
-        refuses(message, call, space)
+    space = panda()
+    space.add(rd.Sphere([0.5, 0.0, 0.6], 0.2, name="ball"))
+    refuses("pose is 2 poses; a line has one end", space.plan_line, [np.eye(4)] * 2, "ready")
+    refuses("unknown obstacle 'bal'; known: ball", space.move, "bal", np.eye(4))
+    refuses("T_world_shape is .*; it must be 4 x 4", space.move, "ball", np.eye(3))
+    refuses("unknown obstacle 'cup'", space.attach, "cup", HOME)
+    refuses("names must differ", space.add, *[rd.Sphere([1, 0, 0], 0.1, name="a")] * 2)
+    refuses("start has 3 values; panda has 7 planned joints", space.plan, HOME, HOME[:3])
+    refuses("unknown link 'nose'", rd.Workspace, space.robot, tip="nose")
+    refuses("step 1 of 1, move to: .*'redy'", space.plan_steps, [rd.MoveTo("redy")], "ready")
+    refuses(
+        "step 1 of 1, grasp: unknown obstacle 'cup'; known: ball", space.plan_steps, [rd.Attach("cup", name="grasp")], "ready"
+    )
+    refuses(
+        "step 1 of 1, go: unknown obstacle in",
+        space.plan_steps,
+        [rd.MoveTo("ready", contacts={"cup": "all"}, name="go")],
+        "ready",
+    )
+    refuses("frame is 'base'; it must be 'tip' or 'world'", rd.MoveRelative, [0, 0, 0.1], "base")
+    refuses(r"xyz is .*; it must be 3 finite numbers", rd.MoveRelative, [0, 0.1])
 
 
 def test_values_by_joint_are_a_configuration() -> None:
@@ -265,10 +263,7 @@ def test_motions_are_joined_with_and_without_a_stop() -> None:
     assert rd.join([there, line], time_limit=10.0).solved
     space.remove("can")
     elsewhere = space.plan("ready", end, time_limit=10.0)
-    for motions, blend, message in (
-        ([there, line], 0.05, "constraints that others lack"),
-        ([there, there], 0.0, r"results\[1\] begins .* rad from the end of results\[0\] in"),
-        ([there], 0.0, "it takes two to join"),
-        ([there, elsewhere], 0.0, r"results\[1\] is for another robot or scene"),
-    ):
-        refuses(message, rd.join, motions, blend)
+    refuses("constraints that others lack", rd.join, [there, line], 0.05)
+    refuses(r"results\[1\] begins .* rad from the end of results\[0\] in", rd.join, [there, there], 0.0)
+    refuses("it takes two to join", rd.join, [there], 0.0)
+    refuses(r"results\[1\] is for another robot or scene", rd.join, [there, elsewhere], 0.0)

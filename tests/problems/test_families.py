@@ -149,9 +149,6 @@ def test_obstacles_stay_clear_of_the_base() -> None:
 
 
 def test_wrong_settings() -> None:
-    for change, message in (
-        ({"kinds": ("sphere", "cone")}, "'cone'; known: box, sphere"),
-        ({"obstacles": (3, 2)}, "obstacles is from 3 to 2"),
-        ({"kinds": ()}, "must not be empty"),
-    ):
-        refuses(message, replace, ROP, **change)
+    refuses("'cone'; known: box, sphere", replace, ROP, kinds=("sphere", "cone"))
+    refuses("obstacles is from 3 to 2", replace, ROP, obstacles=(3, 2))
+    refuses("must not be empty", replace, ROP, kinds=())

@@ -193,9 +193,8 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_goals_are_one_line(case: str, tmp_path: Path) -> None:
-    extra, message = WRONG[case]
+@pytest.mark.parametrize(("extra", "message"), WRONG.values(), ids=WRONG)
+def test_wrong_goals_are_one_line(extra: dict[str, Any], message: str, tmp_path: Path) -> None:
     good = {"robot": "panda", "scene": [TABLE], "start": START, "goal": {"joints": END}}
     refuses(message, rd.load_problem, written(tmp_path, good | extra))
 

@@ -112,9 +112,8 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_payloads_are_one_line(case: str) -> None:
-    data, message = WRONG[case]
+@pytest.mark.parametrize(("data", "message"), WRONG.values(), ids=WRONG)
+def test_wrong_payloads_are_one_line(data: dict[str, Any], message: str) -> None:
     refuses(message, problem_from_record, GOOD | {"payload": data})
 
 

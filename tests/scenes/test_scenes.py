@@ -122,27 +122,24 @@ def test_surface_of_nothing_visible() -> None:
 
 
 def test_wrong_shapes() -> None:
-    for make, message in (
-        (lambda: rd.Sphere([0, 0], 1), r"sphere.center is \[0, 0\]; it must be 3 finite numbers"),
-        (lambda: rd.Sphere([0, 0, np.nan], 1), "sphere.center"),
-        (lambda: rd.Sphere(["a", 0, 0], 1), "sphere.center"),
-        (lambda: rd.Sphere([0, 0, 0], -1), "sphere.radius is -1; it must be a number from"),
-        (lambda: rd.Sphere([0, 0, 0], 1, name=""), "sphere.name"),
-        (lambda: rd.Box([0, 0, 0], [1, 0, 1]), "box.size"),
-        (lambda: rd.Box([0, 0, 0], [1, 1, 1], [0, 0, 0, 0]), "must not be zero"),
-        (lambda: rd.Cylinder([0, 0, 0], 1, np.inf), "cylinder.height is inf"),
-        (lambda: rd.Capsule([0, 0, 0], None, 1), "capsule.radius is None"),  # type: ignore[arg-type]
-        (lambda: rd.Mesh([[0, 0, 0]], [[0, 0, 1]]), "indices of the 1 vertices"),
-        (lambda: rd.Mesh([[0, 0, 0]], []), "mesh.faces"),
-        (lambda: rd.PointCloud([[0, 0]]), "an array of 1 x 2; it must be n x 3"),
-        (lambda: rd.PointCloud([[0, 0, np.inf]]), r"points\[0\] is \[0.0, 0.0, inf\]; its numbers must be finite"),
-        (lambda: rd.PointCloud([[0, 0, 0], [1]]), "it must be n x 3"),
-        (lambda: rd.Scene(["ball"]), r"scene\[0\] is a str"),  # type: ignore[list-item]
-        (lambda: rd.Scene(None), "scene is None; it must be a list of shapes"),  # type: ignore[arg-type]
-        (lambda: rd.Scene(5), "scene is 5; it must be a list of shapes"),  # type: ignore[arg-type]
-        (lambda: VisibleRegion(floor=2.0), "floor is 2"),
-    ):
-        refuses(message, make)
+    refuses(r"sphere.center is \[0, 0\]; it must be 3 finite numbers", rd.Sphere, [0, 0], 1)
+    refuses("sphere.center", rd.Sphere, [0, 0, np.nan], 1)
+    refuses("sphere.center", rd.Sphere, ["a", 0, 0], 1)
+    refuses("sphere.radius is -1; it must be a number from", rd.Sphere, [0, 0, 0], -1)
+    refuses("sphere.name", rd.Sphere, [0, 0, 0], 1, name="")
+    refuses("box.size", rd.Box, [0, 0, 0], [1, 0, 1])
+    refuses("must not be zero", rd.Box, [0, 0, 0], [1, 1, 1], [0, 0, 0, 0])
+    refuses("cylinder.height is inf", rd.Cylinder, [0, 0, 0], 1, np.inf)
+    refuses("capsule.radius is None", rd.Capsule, [0, 0, 0], None, 1)
+    refuses("indices of the 1 vertices", rd.Mesh, [[0, 0, 0]], [[0, 0, 1]])
+    refuses("mesh.faces", rd.Mesh, [[0, 0, 0]], [])
+    refuses("an array of 1 x 2; it must be n x 3", rd.PointCloud, [[0, 0]])
+    refuses(r"points\[0\] is \[0.0, 0.0, inf\]; its numbers must be finite", rd.PointCloud, [[0, 0, np.inf]])
+    refuses("it must be n x 3", rd.PointCloud, [[0, 0, 0], [1]])
+    refuses(r"scene\[0\] is a str", rd.Scene, ["ball"])
+    refuses("scene is None; it must be a list of shapes", rd.Scene, None)
+    refuses("scene is 5; it must be a list of shapes", rd.Scene, 5)
+    refuses("floor is 2", VisibleRegion, floor=2.0)
 
 
 @given(arrays(np.float64, st.tuples(st.integers(0, 30), st.just(3)), elements=st.sampled_from([-0.0, 0.0, 1.5])))

@@ -53,9 +53,8 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_what_is_wrong_is_one_line_of_json(server: httpx.Client, case: str) -> None:
-    sent, code, message = CASES[case]
+@pytest.mark.parametrize(("sent", "code", "message"), CASES.values(), ids=CASES)
+def test_what_is_wrong_is_one_line_of_json(server: httpx.Client, sent: bytes, code: int, message: str) -> None:
     given, record = answer(server, sent)
     assert given == code and message in record["error"] and server.get("/health").status_code == 200
 

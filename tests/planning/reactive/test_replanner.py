@@ -147,6 +147,8 @@ def test_the_arm_waits_for_an_obstacle_at_the_goal() -> None:
 
 
 def test_invalid_steps_are_refused() -> None:
+    replanner = loop(np.array([[0.5, 1.6, 0.5]]))
+    replanner.step({"sphere": [0.5, 1.6, 0.5]}, 0.0)
     for observation, now, message in (
         ({"sphere": [0.5, 1.6, 0.5]}, 0.0, "now is 0 s, but the last step was at 0 s; it must grow"),
         ({"sphere": [0.5, 1.6, 0.5]}, np.nan, "now is nan; it must be a finite number of seconds"),
@@ -154,12 +156,12 @@ def test_invalid_steps_are_refused() -> None:
         ({"sphere": [0.5, np.nan, 0.5]}, 0.1, r"observation\['sphere'\] is"),
         ({"sphere": [0.5, 1.0, 0.5]}, 0.1, r"observation\['sphere'\]: a point of it can have moved 0.6 m in 0.1 s"),
     ):
-        replanner = loop(np.array([[0.5, 1.6, 0.5]]))
-        replanner.step({"sphere": [0.5, 1.6, 0.5]}, 0.0)
         refuses(message, replanner.step, observation, now)
 
 
 def test_replanners_that_cannot_begin() -> None:
+    moving = [rd.MovingObstacle(rd.Sphere([3, 0, 0], 0.1), max_speed=0.1)]
+    problem = rd.Problem(PANDA, rd.Scene([FLOOR]), START, GOAL, moving=moving)
     for fields, message in (
         ({"moving": []}, r"problem\.moving is empty"),
         ({"start": [0, 1.5, 0, -0.5, 0, 2.1, 0.8]}, "the replanner cannot begin: the start is in collision"),
@@ -167,8 +169,6 @@ def test_replanners_that_cannot_begin() -> None:
         ({"constraints": [UPRIGHT]}, r"does not support problem\.constraints"),
         ({"payload": rd.Payload(0.5, link="panda_hand")}, r"does not support problem\.payload"),
     ):
-        moving = [rd.MovingObstacle(rd.Sphere([3, 0, 0], 0.1), max_speed=0.1)]
-        problem = rd.Problem(PANDA, rd.Scene([FLOOR]), START, GOAL, moving=moving)
         refuses(message, rd.Replanner, replace(problem, **fields))
 
 

@@ -128,15 +128,12 @@ def test_gain_zero_does_not_end_the_search() -> None:
 
 
 def test_arguments_are_checked() -> None:
-    for arguments, message in (
-        ({"objective": "energy"}, "length, time"),
-        ({"clearance": float("nan")}, "clearance is nan"),
-        ({"clearance": 5.0}, r"clearance is 5\.0; it must be between 0 and 0\.5"),
-        ({"velocity_scaling": 0.0}, r"velocity_scaling is 0\.0; it must be between 0.001 and 1"),
-        ({"acceleration_scaling": 1.5}, r"acceleration_scaling is 1\.5"),
-        ({"jerk": 1e-5}, r"jerk is 1e-05; it must be at least 0\.01"),
-    ):
-        refuses(message, AORRTC().plan, AROUND, **arguments)
+    refuses("length, time", AORRTC().plan, AROUND, objective="energy")
+    refuses("clearance is nan", AORRTC().plan, AROUND, clearance=float("nan"))
+    refuses(r"clearance is 5\.0; it must be between 0 and 0\.5", AORRTC().plan, AROUND, clearance=5.0)
+    refuses(r"velocity_scaling is 0\.0; it must be between 0.001 and 1", AORRTC().plan, AROUND, velocity_scaling=0.0)
+    refuses(r"acceleration_scaling is 1\.5", AORRTC().plan, AROUND, acceleration_scaling=1.5)
+    refuses(r"jerk is 1e-05; it must be at least 0\.01", AORRTC().plan, AROUND, jerk=1e-5)
 
 
 def test_one_slow_validation_does_not_use_up_later_calls(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -73,19 +73,16 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
 
 
 def test_wrong_problems() -> None:
-    for make, message in (
-        (lambda: problem([0, 0]), "start has 2 values; crane has 3 planned joints: swing, spin, lift"),
-        (lambda: problem(goal=[[0, 0], [1, 1]]), r"goal\[0\] has 2 values"),
-        (lambda: problem([0, np.nan, 0]), r"start: spin is nan; it must be a finite number .* \[rad\]"),
-        (lambda: problem(goal=[[0, 0, 0], [0, 0, 0.6]]), r"goal\[1\]: lift is 0.6 m; its limits are"),
-        (lambda: problem("home"), "start is 'home'; it must be a list of 3 numbers: swing, spin, lift"),
-        (lambda: problem(None), "start is None"),
-        (lambda: problem(goal=rd.PoseGoal("claw", np.eye(4))), "unknown link in goal.frame: 'claw'"),
-        (lambda: problem(goal=rd.PoseGoal("plinth", np.eye(4))), "no planned joint moves 'plinth'"),
-        (lambda: rd.PoseGoal("hook", MIRROR), "it must be a homogeneous transform"),
-        (lambda: rd.Problem(crane(), [], [0], [0]), "scene is .*; it must be a Scene"),  # type: ignore[arg-type]
-    ):
-        refuses(message, make)
+    refuses("start has 2 values; crane has 3 planned joints: swing, spin, lift", problem, [0, 0])
+    refuses(r"goal\[0\] has 2 values", problem, goal=[[0, 0], [1, 1]])
+    refuses(r"start: spin is nan; it must be a finite number .* \[rad\]", problem, [0, np.nan, 0])
+    refuses(r"goal\[1\]: lift is 0.6 m; its limits are", problem, goal=[[0, 0, 0], [0, 0, 0.6]])
+    refuses("start is 'home'; it must be a list of 3 numbers: swing, spin, lift", problem, "home")
+    refuses("start is None", problem, None)
+    refuses("unknown link in goal.frame: 'claw'", problem, goal=rd.PoseGoal("claw", np.eye(4)))
+    refuses("no planned joint moves 'plinth'", problem, goal=rd.PoseGoal("plinth", np.eye(4)))
+    refuses("it must be a homogeneous transform", rd.PoseGoal, "hook", MIRROR)
+    refuses("scene is .*; it must be a Scene", rd.Problem, crane(), [], [0], [0])
 
 
 GOOD: dict[str, Any] = {
@@ -148,9 +145,8 @@ WRONG: dict[str, tuple[object, str]] = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_problem_files(case: str, tmp_path: Path) -> None:
-    data, message = WRONG[case]
+@pytest.mark.parametrize(("data", "message"), WRONG.values(), ids=WRONG)
+def test_wrong_problem_files(data: object, message: str, tmp_path: Path) -> None:
     file = written(tmp_path, data)
     refuses(f"^{re.escape(str(file))}.*{message}", rd.load_problem, file)
 

@@ -138,9 +138,8 @@ WRONG = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_equipment_is_one_line(case: str, tmp_path: Path) -> None:
-    extra, message = WRONG[case]
+@pytest.mark.parametrize(("extra", "message"), WRONG.values(), ids=WRONG)
+def test_wrong_equipment_is_one_line(extra: dict[str, Any], message: str, tmp_path: Path) -> None:
     refuses(message, rd.load_problem, written(tmp_path, PLAIN | extra))
 
 

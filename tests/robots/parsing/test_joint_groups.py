@@ -40,9 +40,8 @@ END = {
 """End effectors by name, and the link where the arm ends."""
 
 
-@pytest.mark.parametrize("name", END)
-def test_grippers_and_hands_are_known_and_held(name: str, tmp_path: Path) -> None:
-    parts, tip = END[name]
+@pytest.mark.parametrize(("parts", "tip"), END.values(), ids=END)
+def test_grippers_and_hands_are_known_and_held(parts: str, tip: str, tmp_path: Path) -> None:
     robot = read_urdf(written(tmp_path, ARM, parts))
     assert robot.tip == tip and robot.joint_names == tuple(row("j", 6))
     held = {j.name for j in robot.joints if j.kind != "fixed"} - {*robot.joint_names}

@@ -180,9 +180,8 @@ WRONG_SCENES: dict[str, tuple[object, str]] = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG_SCENES)
-def test_wrong_scenes(case: str, tmp_path: Path) -> None:
-    data, message = WRONG_SCENES[case]
+@pytest.mark.parametrize(("data", "message"), WRONG_SCENES.values(), ids=WRONG_SCENES)
+def test_wrong_scenes(data: object, message: str, tmp_path: Path) -> None:
     file = tmp_path / "scene.yaml"
     file.write_text(yaml.safe_dump(data))
     with pytest.raises(rd.InputError, match=message) as raised:
@@ -417,9 +416,8 @@ WRONG_REQUESTS: dict[str, tuple[object, str]] = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG_REQUESTS)
-def test_wrong_requests(case: str) -> None:
-    data, message = WRONG_REQUESTS[case]
+@pytest.mark.parametrize(("data", "message"), WRONG_REQUESTS.values(), ids=WRONG_REQUESTS)
+def test_wrong_requests(data: object, message: str) -> None:
     refuses(message, moveit_request, data, moveit_frames({}, PANDA))
 
 
