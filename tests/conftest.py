@@ -32,10 +32,8 @@ def checked_modules() -> list[str]:
 
 
 def parse_in_one_thread_at_a_time() -> None:
-    """CPython 3.11 counts the depth of the syntax trees of all threads together (gh-106905). If two threads
-    parse at once, the error is "SystemError: AST constructor recursion depth mismatch", and a live page has
-    no plan. The hook parses each module when it is imported, and NumPy and beartype parse later, so it is
-    not enough to lock the hook or to import all modules first."""
+    """CPython 3.11 counts the depth of the syntax trees of all threads together (gh-106905), so two that parse at once raise a
+    SystemError. The hook parses modules as they are imported, NumPy and beartype later: to lock the hook is not enough."""
     parse = ast.parse
     parsing = threading.RLock()
 
@@ -47,8 +45,7 @@ def parse_in_one_thread_at_a_time() -> None:
 
 
 def keep_dimensions_of_shapes_alone() -> None:
-    """jaxtyping binds the arguments of every call, to compare the dimensions of shapes. That took a large part
-    of the suite's time, so only beartype checks functions without shapes."""
+    """jaxtyping binds the arguments of every call, which takes long, so functions without shapes are left to beartype."""
     jaxtyped = jaxtyping.jaxtyped
 
     def checked(*, typechecker: Callable[[Any], Any]) -> Callable[[Any], Any]:

@@ -1,5 +1,4 @@
-"""The source: the direction of imports, what `import robotdiffuse` costs, that tests use public names, and that the code of
-each package has at most as many tokens as CONTRIBUTING.md allows; tokens ignore layout."""
+"""The source: directions of imports, what `import robotdiffuse` costs, public names in tests, the size of packages."""
 
 import ast
 import io

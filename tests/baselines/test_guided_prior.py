@@ -204,8 +204,7 @@ def collision_costs(q: np.ndarray, margins: tuple[float, float], between: int = 
 
 @pytest.mark.parametrize("between", [0, 1, 3])
 def test_gradient_of_the_collision_cost(between: int) -> None:
-    """Compares with the difference of costs along the gradient. The cost has kinks where spheres enter a margin
-    and at corners of boxes, so the tolerance is 3 %."""
+    """Compares with the difference of costs along the gradient, within 3 %: the cost has kinks at margins and corners."""
     q = lines(3)
     gradient = guided_prior.collision_gradient(CHECKER, q, 0.05, 0.01, between)
     size = np.sqrt((gradient**2).sum((1, 2)))[:, None, None]

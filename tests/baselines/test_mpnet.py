@@ -61,8 +61,7 @@ def planning(weights: str, problem: Problem, **changes: object) -> NeuralPlannin
     settings = replace(MPNetPlannerSettings(weights), **changes)
     checker = CollisionChecker(problem.robot, problem.scene)
     start_goal = StartGoal(checker, problem.start, np.array([RIGHT]))
-    context = PlanningContext("mpnet", problem, PlanRequest(60.0))
-    return NeuralPlanning(context, start_goal, network(), settings)
+    return NeuralPlanning(PlanningContext("mpnet", problem, PlanRequest(60.0)), start_goal, network(), settings)
 
 
 def wall_problem(scene: Scene = WALL) -> Problem:

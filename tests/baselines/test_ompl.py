@@ -28,8 +28,7 @@ def problem(*goals: np.ndarray, scene: rd.Scene = WALL) -> rd.Problem:
 
 
 def plan(planner: type[ompl.OmplPlanner], problem: rd.Problem, seed: int = 1, limit: float = 0.5) -> rd.PlanResult:
-    """Plan. Anytime planners use all of their time, so they get a short limit; the others get a longer one, for
-    busy machines."""
+    """Anytime planners use all of their time, so they get a short limit; the others get a longer one, for busy machines."""
     if not planner.anytime:
         limit = 120.0
     result = planner().plan(problem, time_limit=limit, seed=seed)
@@ -140,8 +139,7 @@ def test_nothing_stays_in_memory():
     for planner, seed in product(FIRST + ANYTIME, range(3)):
         planner().plan(problem(RIGHT), time_limit=0.05, seed=seed)
     gc.collect()
-    kept = [each for each in gc.get_objects() if issubclass(type(each), OMPL_CHECKS)]
-    assert not kept
+    assert not [each for each in gc.get_objects() if issubclass(type(each), OMPL_CHECKS)]
 
 
 def test_without_ompl_the_error_says_what_to_install(monkeypatch):

@@ -14,8 +14,7 @@ NEEDS |= {"certificates": ("ompl",), "mujoco_models": ("mujoco",), "planning_req
 NEEDS |= {"scene_code": ("accelerate", "matplotlib", "zarr"), "server": ("fastapi", "httpx")}
 """Packages of extras that a script needs."""
 APART = {"robustness", "scene_code", "server", "startup", "urdf_import"}
-"""These start processes, measure their own, or train on inputs of other shapes than the package's. For the others, a
-process would load all code once more."""
+"""They start or measure processes, or train on other shapes of inputs. For the others, a process would load all code again."""
 REPORTS = FOLDER / "results"
 NO_SCRIPT = "no longer kept"
 

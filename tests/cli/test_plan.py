@@ -173,9 +173,7 @@ def test_plan_and_verify_name_allowed_contacts(tmp_path: Path, said: Said) -> No
 NEAR = {"joints": [-0.95, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]}
 
 
-def test_explore_writes_a_replay_a_strip_and_a_recording(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_explore_writes_files(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("robotdiffuse.visualization.exploration.TILE", PictureSettings(width=240, height=150, ghosts=1))
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)

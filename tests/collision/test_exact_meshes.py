@@ -42,8 +42,7 @@ def test_links_without_meshes_are_their_spheres() -> None:
         rd.Capsule((0.9, -0.4, 0), 0.1, 0.6),
         rd.Cylinder((-0.6, 0, 0), 0.2, 1.0, (np.sqrt(0.5), np.sqrt(0.5), 0, 0)),
     ]
-    exact = ExactCollision(replace(box_arm(), meshes={}, spheres=spheres), rd.Scene(obstacles))
-    found = exact.link_distances(Q0)
+    found = ExactCollision(replace(box_arm(), meshes={}, spheres=spheres), rd.Scene(obstacles)).link_distances(Q0)
     assert [one.other for one in found] == ["cylinder", "box", "capsule"]
     assert [one.distance for one in found] == pytest.approx([0.6 - 0.2 - 0.04, 0.35 - 0.04, 0.4 - 0.1 - 0.04])
 
@@ -112,8 +111,7 @@ def test_a_mesh_is_its_surface() -> None:
 def test_nearest_honors_cutoffs_and_stops() -> None:
     exact = ExactCollision(box_arm(), rd.Scene([rd.Sphere((0.2, 0.5, 0), 0.1)]))
     q = np.zeros((4, 3))
-    checks = np.array([0, 0, 2, 0])
-    distances, names = exact.nearest(q, checks, np.array([1.0, 0.2, 1.0, 1.0]), stop=0.3)
+    distances, names = exact.nearest(q, np.array([0, 0, 2, 0]), np.array([1.0, 0.2, 1.0, 1.0]), stop=0.3)
     assert distances[0] == pytest.approx(0.4 - HALF_WIDTH) and distances[1] == 0.2
     assert np.isnan(distances[2:]).all() and names == ["sphere", None, None, None]
 
@@ -147,6 +145,5 @@ def test_collisions_are_explained() -> None:
 
 
 def test_fixed_links_do_not_count_against_the_scene() -> None:
-    robot = box_arm().with_locked({"j0": 0.0})
-    exact = ExactCollision(robot, rd.Scene([rd.Sphere((0.2, 0, 0), 0.1)]))
+    exact = ExactCollision(box_arm().with_locked({"j0": 0.0}), rd.Scene([rd.Sphere((0.2, 0, 0), 0.1)]))
     assert exact.links == ("l2", "l3") and not exact.collides(np.zeros((1, 2)))[0]

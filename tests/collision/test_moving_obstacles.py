@@ -40,9 +40,8 @@ def obstacle(k: int, rng: np.random.Generator) -> rd.MovingObstacle:
 
 
 def as_coal_sees(moves: rd.MovingObstacle, times: np.ndarray, q: np.ndarray) -> tuple[float | None, float]:
-    """The first checked time at which arm and obstacle touch by Coal, and the smallest distance at the times
-    checked before. Where they are far apart, times at which they cannot have come nearer than MOVED are left
-    out."""
+    """The first time at which arm and obstacle touch by Coal, and the smallest distance before. Times at which they cannot
+    have come nearer than MOVED are left out."""
     moments = np.arange(0.0, times[-1], STEP)
     k = 0
     least = np.inf
@@ -125,7 +124,7 @@ def test_motions_that_are_none() -> None:
         ({"times": [0.0, np.nan], "poses": [STANDS] * 2}, "sphere.times .* two or more times"),
         ({"times": [0, 0.01], "poses": [STANDS, AWAY]}, r"sphere.poses\[1\] is a jump: from .* at 346 m/s"),
         ({"times": [0, 1], "poses": [AWAY] * 2}, r"sphere.poses\[0\] is at .*; it must be the pose of"),
-        ({"times": [0.0, 1.0], "poses": [STANDS, 2 * STANDS]}, r"sphere.poses\[1\] is .*must be a rotation"),
+        ({"times": [0.0, 1.0], "poses": [STANDS, 2 * STANDS]}, r"sphere.poses\[1\] is .*must be a homogeneous transform"),
     ):
         refuses(message, rd.MovingObstacle, BALL, **motion)
     refuses("point_cloud", rd.MovingObstacle, rd.PointCloud([[0.5, 0, 0.5]]), velocity=[0, 1, 0])

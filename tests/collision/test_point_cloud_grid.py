@@ -123,5 +123,4 @@ def test_nearest_voxels_are_those_of_a_distance_transform(shape, count) -> None:
     there = np.stack(np.unravel_index(held, shape), axis=-1)[holders]
     away = there - np.moveaxis(np.indices(shape), 0, -1)
     np.testing.assert_array_equal(squares, (away**2).sum(axis=-1))
-    distances = np.asarray(distance_transform_edt(run < 0))
-    np.testing.assert_allclose(np.sqrt(squares), distances, rtol=1e-6)
+    np.testing.assert_allclose(np.sqrt(squares), np.asarray(distance_transform_edt(run < 0)), rtol=1e-6)

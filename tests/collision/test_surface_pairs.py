@@ -76,8 +76,7 @@ def test_meshes_that_touch_collide() -> None:
     assert explain_collision(channel(), EMPTY, q) is not None
     problem = rd.Problem(channel(), EMPTY, q, rd.JointGoal(np.zeros((1, 2))))
     assert rd.load_planner("rrt_connect").plan(problem, time_limit=5.0).status == rd.Status.INVALID_START
-    path = rd.Path(channel().joint_names, np.stack([np.zeros(2), q]))
-    assert not rd.verify(problem, path).valid
+    assert not rd.verify(problem, rd.Path(channel().joint_names, np.stack([np.zeros(2), q]))).valid
 
 
 def test_a_body_inside_another_and_deep_overlaps_of_convex_parts_collide() -> None:

@@ -1,5 +1,4 @@
-"""Bounds on the numbers that users give; `rd.pose`; arguments of the wrong type raise a one-line InputError, for every public
-function. These calls run in a separate process: in this one, beartype, which the tests enable, would raise an error first."""
+"""Bounds on the numbers that users give; `rd.pose`; for arguments of the wrong type, every public function says so."""
 
 from dataclasses import replace
 

@@ -164,9 +164,7 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
 
 @pytest.mark.parametrize("damage", DAMAGE)
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
-def test_damaged_files_of_compiled_code_are_compiled_anew(
-    damage: str, ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_damaged_files_are_compiled_anew(damage: str, ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Regression: a truncated file caused a traceback in every run until somebody deleted it."""
     monkeypatch.setattr(kernels, "cache_folder", lambda: tmp_path)
 

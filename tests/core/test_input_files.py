@@ -23,17 +23,8 @@ from trimesh.exchange.ply import export_ply
 
 from helpers.refusals import refuses
 from robotdiffuse import Box, InputError, Scene
+from robotdiffuse.core import input_files
 from robotdiffuse.core.errors import OutputError, distinct, joined, located, shown, unknown_name
-from robotdiffuse.core.input_files import (
-    MAX_SHOWN_NAME,
-    input_file,
-    is_file,
-    parse_json,
-    parse_xml,
-    parse_yaml,
-    read_arrays,
-    read_text,
-)
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.types import check_motion_arrays
 from robotdiffuse.scenes.scene import MAX_CONTACT_LINKS
@@ -54,24 +45,21 @@ NAMED = {
 
 
 def one_line(call: Callable[[], object]) -> str:
-    with pytest.raises(InputError) as raised:
-        call()
-    message = str(raised.value)
-    assert "\n" not in message
+    message = refuses("", call)
     assert message.isprintable()
     assert len(message) < 500
     return message
 
 
 MALFORMED: dict[Callable[[Any, str], object], tuple[tuple[str | bytes, str], ...]] = {
-    parse_json: (
+    input_files.parse_json: (
         ("[" * DEEP, "more than 64 levels deep"),
         ('"' + "[" * DEEP, "is not valid JSON"),
         ("9" * 5000, "integer 9999"),
         ("[1, 2", "line 1, column 6"),
         ('{"a": {"b": 1, "b": 2}}', "b appears twice"),
     ),
-    parse_yaml: (
+    input_files.parse_yaml: (
         ("[" * DEEP, "more than 64 levels deep"),
         ("- " * DEEP, "more than 64 levels deep"),
         ("? " * DEEP, "a key is not a plain string"),
@@ -86,7 +74,7 @@ MALFORMED: dict[Callable[[Any, str], object], tuple[tuple[str | bytes, str], ...
         ("\0", "is not valid YAML"),
         ("\ud800", "surrogate"),
     ),
-    parse_xml: (
+    input_files.parse_xml: (
         (b"<a>" * DEEP + b"</a>" * DEEP, "more than 64 levels deep"),
         (b'<?xml version="1.0" encoding="klingon"?><robot/>', "unknown encoding"),
         (b"", "no element found"),
@@ -106,12 +94,12 @@ def test_text_that_is_malformed_nested_too_deep_or_a_bomb(parse: Callable[[Any, 
 
 def test_brackets_in_texts_are_no_nesting() -> None:
     value = ["[" * 500, '\\"{' * 500, {"a": [[1]]}]
-    assert parse_json(json.dumps(value), "it") == value
+    assert input_files.parse_json(json.dumps(value), "it") == value
 
 
 def test_what_yaml_means() -> None:
     text = "{a: 1e-3, b: [0x10, -2, yes, ~, 1:30, 2001-13-45], c: &x {d: .inf}, e: *x, f: '1', g: 1.5e3}"
-    assert parse_yaml(text, "it") == {
+    assert input_files.parse_yaml(text, "it") == {
         "a": 0.001,
         "b": [16, -2, True, None, 90, "2001-13-45"],
         "c": {"d": np.inf},
@@ -119,8 +107,8 @@ def test_what_yaml_means() -> None:
         "f": "1",
         "g": 1500.0,
     }
-    assert parse_yaml("", "it") is None
-    assert parse_yaml("{1: a, on: b, ~: c}", "it") == {"1": "a", "on": "b", "~": "c"}
+    assert input_files.parse_yaml("", "it") is None
+    assert input_files.parse_yaml("{1: a, on: b, ~: c}", "it") == {"1": "a", "on": "b", "~": "c"}
 
 
 values = st.recursive(
@@ -131,14 +119,18 @@ values = st.recursive(
 
 @given(values)
 def test_what_is_written_is_read_back(value: object) -> None:
-    assert parse_json(json.dumps(value), "it") == value
-    assert parse_yaml(yaml.dump(value, Dumper=yaml.CSafeDumper), "it") == value
+    assert input_files.parse_json(json.dumps(value), "it") == value
+    assert input_files.parse_yaml(yaml.dump(value, Dumper=yaml.CSafeDumper), "it") == value
 
 
 @given(st.binary(max_size=200))
 def test_any_bytes_are_a_value_or_one_line(content: bytes) -> None:
     text = content.decode("latin-1")
-    for parse in (parse_json, parse_yaml, lambda text, where: parse_xml(text.encode(), where)):
+    for parse in (
+        input_files.parse_json,
+        input_files.parse_yaml,
+        lambda text, where: input_files.parse_xml(text.encode(), where),
+    ):
         try:
             parse(text, "it")
         except InputError as error:
@@ -165,14 +157,14 @@ def test_files_that_are_none(tmp_path: Path) -> None:
         ("\ud800", "not a valid file name"),
         ("x" * 1000, "File name too long"),
     ]:
-        assert message in one_line(lambda file=file: read_text(file, "robot file"))
-    assert not any(map(is_file, (pipe, link, tmp_path, "a\0b", "\ud800", "x" * 1000)))
+        assert message in one_line(lambda file=file: input_files.read_text(file, "robot file"))
+    assert not any(map(input_files.is_file, (pipe, link, tmp_path, "a\0b", "\ud800", "x" * 1000)))
     with pytest.MonkeyPatch.context() as patch:
         closed.touch()
         patch.setattr(os, "access", lambda *_: False)  # root may read everything
-        assert "permission denied" in one_line(lambda: input_file(closed))
+        assert "permission denied" in one_line(lambda: input_files.input_file(closed))
     long = tmp_path / ("y" * 200)
-    assert str(long) in one_line(lambda: input_file(long)) or len(str(long)) > MAX_SHOWN_NAME
+    assert str(long) in one_line(lambda: input_files.input_file(long)) or len(str(long)) > input_files.MAX_SHOWN_NAME
 
 
 def test_a_broken_mesh_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -218,10 +210,10 @@ def test_a_pipe_that_a_mesh_file_names_is_not_waited_for(kind: str, tmp_path: Pa
 def test_arrays_of_python_objects_are_refused(tmp_path: Path) -> None:
     for name, save in (("points.npy", np.save), ("points.npz", np.savez)):
         save(tmp_path / name, np.array([{"a": 1}], object))
-        refuses("is damaged", read_arrays, tmp_path / name)
+        refuses("is damaged", input_files.read_arrays, tmp_path / name)
     # an archive called .npy was returned unread and open
     np.savez(tmp_path / "points.npz", points=np.zeros(3))
-    refuses("is damaged", read_arrays, (tmp_path / "points.npz").rename(tmp_path / "points.npy"))
+    refuses("is damaged", input_files.read_arrays, (tmp_path / "points.npz").rename(tmp_path / "points.npy"))
 
 
 def test_errors_keep_their_kind_and_their_lines_where_they_are_copied_or_located() -> None:

@@ -89,8 +89,7 @@ def test_json_that_is_wrong() -> None:
 
 def test_assignments() -> None:
     changed = Search().changed(["step=1e-3", "inner.cells=5", "greedy=true", "range=none", "order=best"])
-    expected = Search(step=0.001, inner=Coarse(5), greedy=True, range=None, order="best")
-    assert changed == expected
+    assert changed == Search(step=0.001, inner=Coarse(5), greedy=True, range=None, order="best")
     assert Search().changed(["levels=[1, 2]"]).levels == (1.0, 2.0)
 
 

@@ -103,8 +103,7 @@ def test_standard_loader_and_pickles(store, workers):
     data = RopDataset(store, "validation", points=12)
     batches = list(DataLoader(data, batch_size=5, num_workers=workers))
     q = torch.cat([batch["trajectories"] for batch in batches])
-    expected = joined(data.batches(5, shuffle=False))
-    torch.testing.assert_close(q, expected.trajectories, atol=0, rtol=0)
+    torch.testing.assert_close(q, joined(data.batches(5, shuffle=False)).trajectories, atol=0, rtol=0)
     assert batches[0]["points"].shape == (5, 12, 3)
     assert data[-1].keys() == {field.name for field in fields(RopBatch)}
     torch.testing.assert_close(data[-1]["trajectories"], q[-1], atol=0, rtol=0)

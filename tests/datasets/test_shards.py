@@ -168,9 +168,7 @@ DAMAGE = [
 @pytest.mark.parametrize(("message", "damage"), DAMAGE)
 def test_damage_gives_one_line(store, message, damage):
     damage(store)
-    with pytest.raises(InputError, match=message) as caught:
-        shards.check_shard(store, 0, shards.read_manifest(store))
-    assert "\n" not in str(caught.value) and "shard_00000.zarr" in str(caught.value)
+    assert "shard_00000.zarr" in refuses(message, shards.check_shard, store, 0, shards.read_manifest(store))
     shards.check_shard(store, 1, shards.read_manifest(store))
 
 

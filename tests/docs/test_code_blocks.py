@@ -1,5 +1,4 @@
-"""Every code block of the README and of the documentation does what it says; see helpers/code_blocks.py. Each example of
-docs/extending.md is saved as a module, added to its table by its line, and used."""
+"""Every code block of the README and the documentation does what it says; what docs/extending.md adds to tables is used."""
 
 import json
 import os

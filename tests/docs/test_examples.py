@@ -1,5 +1,4 @@
-"""Each example runs, solves its problem and writes its picture, which the gallery shows; public functions and the classes of
-docs/reference/modules.md document their parameters and results in Google's style, and examples of public names run."""
+"""Each example runs and writes its picture; public names are documented in Google's style, and their examples run."""
 
 import dataclasses
 import doctest
@@ -30,9 +29,7 @@ SLOW = {"01_own_robot", "05_depth_camera", "09_two_arms", "12_train_on_own_data"
 
 @pytest.mark.usefixtures("small_pictures")
 @pytest.mark.parametrize("example", [pytest.param(e, id=e.stem, marks=[pytest.mark.slow] * (e.stem in SLOW)) for e in EXAMPLES])
-def test_an_example_runs(
-    example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_example_runs(example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
     if example.stem == "01_own_robot":

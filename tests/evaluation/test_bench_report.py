@@ -187,14 +187,13 @@ def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> Non
 
 
 def test_intervals_are_over_problems_not_over_their_seeds(tmp_path: Path) -> None:
-    durations = {"a": 1.0, "b": 2.0, "c": 4.0}
     (section,) = bench_comparisons.sections(
         bench_comparisons.read_bench(
             write(
                 tmp_path / "run",
                 [
                     solved("mpd", name, 1.0, [(0.1, 2.0)], seed=seed, measures=MEASURES | {"duration": duration})
-                    for name, duration in durations.items()
+                    for name, duration in {"a": 1.0, "b": 2.0, "c": 4.0}.items()
                     for seed in range(8)
                 ],
             )
@@ -203,8 +202,7 @@ def test_intervals_are_over_problems_not_over_their_seeds(tmp_path: Path) -> Non
     )
     row = rows(section, 1.0)["mpd"]
     half = 1.96 * np.std([1, 2, 4], ddof=1) / np.sqrt(3)
-    mean = row.mean(METRICS["duration"])
-    assert str(mean) == f"{7 / 3:.2f} ± {half:.2f}"
+    assert str(row.mean(METRICS["duration"])) == f"{7 / 3:.2f} ± {half:.2f}"
     assert str(row.success) == str(bench_report.success_in("rop", row)) == "100.0 (43.9 to 100.0)"  # of three
 
 

@@ -1,5 +1,4 @@
-"""The paper's tables. Table 1: problems with both kinds of goal, ComScores by hand, its rows, a page made once. Table 2:
-configs by name, metrics of motions, the runner."""
+"""The paper's tables: problems with both kinds of goal, ComScores by hand, rows, a page made once; configs, the runner."""
 
 import json
 from pathlib import Path

@@ -23,10 +23,7 @@ def box_mesh(low: ndarray, high: ndarray) -> ConvexMesh:
 
 @cache
 def box_arm(spheres: bool = True) -> Robot:
-    """Three boxes of 0.5, 0.4 and 0.3 m that turn about z, 6 cm wide and high, covered by spheres.
-
-    The base has no geometry. The first and the third box are checked against each other.
-    """
+    """Three boxes of 0.5, 0.4 and 0.3 m that turn about z, 6 cm wide and high; the first and the third may collide."""
     lengths = (0.5, 0.4, 0.3)
     robot = planar_arm(*lengths)
     meshes = {}

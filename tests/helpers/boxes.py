@@ -11,8 +11,7 @@ def surface(mesh: trimesh.Trimesh) -> Surface:
 
 
 def boxes(*ends: tuple[tuple[float, ...], tuple[float, ...]]) -> trimesh.Trimesh:
-    """Closed boxes from their lowest to their highest corners; boxes share no vertices, so there are inner walls where they
-    meet."""
+    """Closed boxes from their lowest to their highest corners; where they meet, there are inner walls."""
     made = trimesh.util.concatenate([trimesh.creation.box(bounds=np.array(each)) for each in ends])
     assert isinstance(made, trimesh.Trimesh)
     return made

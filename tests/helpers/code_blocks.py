@@ -1,15 +1,13 @@
-"""The code blocks of Markdown pages, and how each kind is tried.
+"""The code blocks of Markdown pages, tried in order in one empty folder and with one set of Python names.
 
-All blocks of a page are tried in order, in one empty folder and with one set of Python names. Comments before
-a block, which pages do not show, say more about it:
+Comments before a block, which pages do not show, say more about it:
 
     <!-- file: NAME -->    the block is the content of this file, for what comes after it
     <!-- needs: NAME -->   one of PREPARED is put into the folder first
     <!-- test: run -->     commands are run, not only looked at
     <!-- test: parse -->   Python is compiled, not run
 
-Python runs. Problems in YAML are loaded. The parser of the command line checks commands, `make -n` targets.
-`text` is output. Anything else is an error, so that no block goes untested in silence.
+A language that TRIED lacks is an error, so that no block goes untested in silence.
 """
 
 import re

@@ -40,8 +40,7 @@ def cloud(n: int, seed: int = 0) -> torch.Tensor:
 
 @cache
 def _saved(exports: Callable[[MotionNetwork], object]) -> tempfile.TemporaryDirectory[str]:
-    """The folder with the saved model. The export to ONNX takes seconds, so the model is saved once with ONNX
-    files, and once without for tests that patch `exports`. The folder is removed when the process ends."""
+    """A folder with the saved model, removed at the end; the export takes seconds, so it is made once for each `exports`."""
     folder = tempfile.TemporaryDirectory()
     save_network("model", small_model(), folder.name, {})
     return folder

@@ -1,5 +1,4 @@
-"""Small data sets in the format of the data factory, made without planning, for tests of code that reads them: of random
-arrays, and of straight motions with correct records."""
+"""Small data sets in the format of the data factory, made without planning: random arrays, straight motions with records."""
 
 from pathlib import Path
 from typing import Any

@@ -22,15 +22,7 @@ from helpers.refusals import refuses
 from robotdiffuse import Problem, Scene, Trajectory
 from robotdiffuse.core.errors import OutputError
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.interop import READERS, TRAJECTORY_ENDINGS, WRITERS, read_motion, ros2, write_motion
-from robotdiffuse.interop.recorded_motion import (
-    checked_motion,
-    joint_trajectory,
-    motion_from_record,
-    motion_of_robot,
-    problem_of_motion,
-    publish,
-)
+from robotdiffuse.interop import READERS, TRAJECTORY_ENDINGS, WRITERS, read_motion, recorded_motion, ros2, write_motion
 
 START = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
 GOAL = [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
@@ -68,7 +60,7 @@ def test_what_is_exported_is_read_again_and_validated_the_same(ending: str, plan
     file = tmp_path / f"motion{ending}"
     for _ in range(2):  # a file that is there is replaced
         write_motion(problem, trajectory, file)
-    found = motion_of_robot(read_motion(file), problem.robot)
+    found = recorded_motion.motion_of_robot(read_motion(file), problem.robot)
     assert found.notes == () and isinstance(found.motion, Trajectory)
     np.testing.assert_array_equal(found.motion.positions, trajectory.positions)
     np.testing.assert_array_equal(found.motion.velocities, trajectory.velocities)
@@ -110,7 +102,7 @@ def test_mcap_holds_scene_urdf_frames_and_joint_states(planned: Planned, tmp_pat
     placed = {frame.child_frame_id for frame in frames[0]} | {"panda_link0"}
     assert {entity.frame_id for entity in entities.values()} <= placed
     assert json.loads(attached["problem.json"])["start"] == START
-    found = motion_of_robot(read_motion(tmp_path / "m.mcap", "/joint_states"), PANDA)
+    found = recorded_motion.motion_of_robot(read_motion(tmp_path / "m.mcap", "/joint_states"), PANDA)
     assert "panda_finger_joint1, panda_finger_joint2 stay at their locked values" in found.notes
     np.testing.assert_array_equal(found.motion.positions, trajectory.positions)
     refuse(tmp_path / "m.mcap", r"topic '/tf' holds no motion; topics: .*/joint_trajectory", "/tf")
@@ -154,9 +146,7 @@ def test_rerun_recordings_hold_the_joints(planned: Planned, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("name", ["m.mcap", "bag"])
 @pytest.mark.parametrize("compression", ["ZSTD", "LZ4"])
-def test_a_recording_that_unpacks_to_gigabytes_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, compression: str
-) -> None:
+def test_unpacked_gigabytes_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, compression: str) -> None:
     """Regression: a file of 105 kB took 6 GB of memory."""
     from mcap.writer import CompressionType, Writer
 
@@ -181,8 +171,7 @@ def test_a_motion_of_too_many_messages_is_refused(planned: Planned, tmp_path: Pa
     monkeypatch.setattr(ros2, "checked_reader", lambda stream, where: ros2.make_reader(stream))
     monkeypatch.setattr(ros2, "MAX_UNPACKED", 100)
     for name in ("m.mcap", "bag.rosbag2"):
-        wanted = "the messages of /joint_trajectory take more than 100 bytes"
-        refuse(tmp_path / name, wanted, "/joint_trajectory")
+        refuse(tmp_path / name, "the messages of /joint_trajectory take more than 100 bytes", "/joint_trajectory")
 
 
 @pytest.mark.parametrize("ending", sorted([*WRITERS, *TRAJECTORY_ENDINGS]))
@@ -204,7 +193,7 @@ def test_joints_are_put_into_order_by_name() -> None:
     record["joint_names"].reverse()
     for point in record["points"]:
         point["positions"] = point["positions"][::-1]
-    found = motion_of_robot(motion_from_record(record, "it"), PANDA)
+    found = recorded_motion.motion_of_robot(recorded_motion.motion_from_record(record, "it"), PANDA)
     assert found.motion.positions[0].tolist() == START and "joints were reordered by name" in found.notes
     assert "no accelerations are given: those of the cubics through the rows are validated" in found.notes
 
@@ -220,47 +209,47 @@ def test_all_forms_of_messages_hold_the_same_motion() -> None:
         {"trajectory": {"joint_trajectory": record}},
     )
     for form in forms:
-        found = motion_from_record(form, "it")
+        found = recorded_motion.motion_from_record(form, "it")
         assert found.times is not None and found.times.tolist() == [0, 1]
         assert found.positions[1].tolist() == START
 
 
 def test_times_that_begin_later_and_no_times() -> None:
-    found = checked_motion(["a"], [[0.0], [1.0]], [0.5, 1.0])
+    found = recorded_motion.checked_motion(["a"], [[0.0], [1.0]], [0.5, 1.0])
     assert found.times is not None and found.times.tolist() == [0.0, 0.5]
     assert found.notes == ("times begin at 0.5 s; they were shifted to 0",)
-    assert checked_motion(["a"], [[0.0], [1.0]], [0, 0]).times is None
-    assert checked_motion(["a"], [[0.0], [1.0]]).times is None
+    assert recorded_motion.checked_motion(["a"], [[0.0], [1.0]], [0, 0]).times is None
+    assert recorded_motion.checked_motion(["a"], [[0.0], [1.0]]).times is None
 
 
 def test_positions_and_times_alone_are_validated_on_the_smoothest_curve() -> None:
     robot = box_arm()
     t = np.linspace(0, 2, 41)
     q = np.outer(10 * (t / 2) ** 3 - 15 * (t / 2) ** 4 + 6 * (t / 2) ** 5, [0.5, -0.4, 0.3])
-    found = motion_of_robot(checked_motion(robot.joint_names, q, t), robot)
+    found = recorded_motion.motion_of_robot(recorded_motion.checked_motion(robot.joint_names, q, t), robot)
     assert isinstance(found.motion, Trajectory)
     report = rd.verify(Problem(robot, Scene(), q[0], q[-1]), found.motion)
     assert report.valid, report.violation
-    hasty = motion_of_robot(checked_motion(robot.joint_names, q, t / 10), robot).motion
+    hasty = recorded_motion.motion_of_robot(recorded_motion.checked_motion(robot.joint_names, q, t / 10), robot).motion
     assert isinstance(hasty, Trajectory)
     refused = rd.verify(Problem(robot, Scene(), q[0], q[-1]), hasty).violation
     assert refused is not None and refused.kind in ("velocity", "acceleration", "jump")
 
 
 def of_panda(names: list[str], rows: list[list[float]]) -> None:
-    motion_of_robot(checked_motion(names, rows), PANDA)
+    recorded_motion.motion_of_robot(recorded_motion.checked_motion(names, rows), PANDA)
 
 
 REFUSED: dict[str, tuple[Callable[..., object], tuple[Any, ...], str]] = {
-    "twice": (checked_motion, (["a", "a"], [[0, 0]]), "joint_names has a more than once"),
-    "no rows": (checked_motion, (["a"], []), "positions is empty; it must be n x 1 finite numbers"),
-    "ragged": (checked_motion, (["a"], [[0], [0, 1]]), r"positions is \[\[0\], .*; it must be n x 1"),
-    "nan": (checked_motion, (["a"], [[0], [np.nan]]), r"positions\[1\] is \[nan\]; its numbers"),
-    "huge": (checked_motion, (["a"], [[1e30]]), "must be finite and within ±10000"),
-    "short rates": (checked_motion, (["a"], [[0], [1]], [0, 1], [[0]]), "velocities is an array of 1 x 1"),
-    "nan time": (checked_motion, (["a"], [[0], [1]], [0, np.nan]), r"times\[1\] is nan"),
-    "backwards": (checked_motion, (["a"], [[0], [1]], [1, 1]), "times do not increase: 1 s in row 0, 1 s"),
-    "two weeks": (checked_motion, (["a"], [[0], [1]], [0, 1.2e6]), r"times span 1.2e\+06 s; a motion must"),
+    "twice": (recorded_motion.checked_motion, (["a", "a"], [[0, 0]]), "joint_names has a more than once"),
+    "no rows": (recorded_motion.checked_motion, (["a"], []), "positions is empty; it must be n x 1 finite numbers"),
+    "ragged": (recorded_motion.checked_motion, (["a"], [[0], [0, 1]]), r"positions is \[\[0\], .*; it must be n x 1"),
+    "nan": (recorded_motion.checked_motion, (["a"], [[0], [np.nan]]), r"positions\[1\] is \[nan\]; its numbers"),
+    "huge": (recorded_motion.checked_motion, (["a"], [[1e30]]), "must be finite and within ±10000"),
+    "short rates": (recorded_motion.checked_motion, (["a"], [[0], [1]], [0, 1], [[0]]), "velocities is an array of 1 x 1"),
+    "nan time": (recorded_motion.checked_motion, (["a"], [[0], [1]], [0, np.nan]), r"times\[1\] is nan"),
+    "backwards": (recorded_motion.checked_motion, (["a"], [[0], [1]], [1, 1]), "times do not increase: 1 s in row 0, 1 s"),
+    "two weeks": (recorded_motion.checked_motion, (["a"], [[0], [1]], [0, 1.2e6]), r"times span 1.2e\+06 s; a motion must"),
     "a joint is missing": (of_panda, (NAMES[1:], [START[1:]]), "the motion lacks panda_joint1"),
     "a finger elsewhere": (
         of_panda,
@@ -272,19 +261,19 @@ REFUSED: dict[str, tuple[Callable[..., object], tuple[Any, ...], str]] = {
         ([*NAMES, FINGERS[0]], [[*START, 0.04], [*START, 0.0]]),
         "moves panda_finger_joint1 from 0 to 0.04, which the problem locks at 0.04",
     ),
-    "no points": (motion_from_record, (panda_record(points=[]), "it"), r"it: points is \[\]"),
+    "no points": (recorded_motion.motion_from_record, (panda_record(points=[]), "it"), r"it: points is \[\]"),
     "no time": (
-        motion_from_record,
+        recorded_motion.motion_from_record,
         (panda_record(points=[{"positions": START, "time_from_start": "soon"}]), "it"),
         "time_from_start is 'soon'; it must be a duration",
     ),
     "a base that drives": (
-        motion_from_record,
+        recorded_motion.motion_from_record,
         ({"joint_trajectory": panda_record(), "multi_dof_joint_trajectory": {"points": [{}]}}, "it"),
         "multi_dof_joint_trajectory has points; only arms on a fixed base can be validated",
     ),
-    "two parts": (motion_from_record, ({"trajectory": [{}, {}]}, "it"), "trajectory has 2 parts"),
-    "no plan": (motion_from_record, ({"status": "timeout"}, "it"), "it holds no motion: its status is 't"),
+    "two parts": (recorded_motion.motion_from_record, ({"trajectory": [{}, {}]}, "it"), "trajectory has 2 parts"),
+    "no plan": (recorded_motion.motion_from_record, ({"status": "timeout"}, "it"), "it holds no motion: its status is 't"),
 }
 
 
@@ -358,10 +347,10 @@ def test_yaml_as_ros2_topic_echo_prints_it(tmp_path: Path) -> None:
 
 
 def test_a_motion_alone_says_what_it_solves() -> None:
-    motion = checked_motion([*NAMES, *FINGERS], [[*START, 0.01, 0.02], [*GOAL, 0.01, 0.02]])
-    problem = problem_of_motion(motion, PANDA, Scene())
+    motion = recorded_motion.checked_motion([*NAMES, *FINGERS], [[*START, 0.01, 0.02], [*GOAL, 0.01, 0.02]])
+    problem = recorded_motion.problem_of_motion(motion, PANDA, Scene())
     assert problem.robot.locked == {"panda_finger_joint1": 0.01, "panda_finger_joint2": 0.02}
-    assert motion_of_robot(motion, problem.robot).motion.positions[-1].tolist() == GOAL
+    assert recorded_motion.motion_of_robot(motion, problem.robot).motion.positions[-1].tolist() == GOAL
 
 
 def test_unknown_endings_list_the_known_ones(planned: Planned, tmp_path: Path) -> None:
@@ -375,7 +364,7 @@ def test_unknown_endings_list_the_known_ones(planned: Planned, tmp_path: Path) -
     [
         ("mcap.reader", "mcap", "ros", lambda: import_module("robotdiffuse.interop.ros2")),
         ("rerun", "rerun-sdk", "rerun", lambda: import_module("robotdiffuse.interop.rerun_file")),
-        ("roslibpy", "roslibpy", "ros", lambda: publish(MOTION, "", 1, "/a", 1.0)),
+        ("roslibpy", "roslibpy", "ros", lambda: recorded_motion.publish(MOTION, "", 1, "/a", 1.0)),
     ],
 )
 def test_a_missing_extra_says_what_to_install(
@@ -404,19 +393,19 @@ def test_motions_are_published_to_a_rosbridge(planned: Planned, monkeypatch: pyt
     monkeypatch.setattr(recorded_motion, "sleep", wait)
     with serve(lambda client: heard.extend(map(json.loads, client)), "127.0.0.1", 0) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        publish(trajectory, "127.0.0.1", server.socket.getsockname()[1], "/arm/joint_trajectory", 5.0)
+        recorded_motion.publish(trajectory, "127.0.0.1", server.socket.getsockname()[1], "/arm/joint_trajectory", 5.0)
         server.shutdown()
     assert waited == ["advertise", "publish"]
     advertised, published = heard[:2]
     assert (advertised["op"], advertised["type"]) == ("advertise", "trajectory_msgs/msg/JointTrajectory")
     assert (published["op"], published["topic"]) == ("publish", "/arm/joint_trajectory")
-    assert published["msg"] == joint_trajectory(trajectory)
-    found = motion_of_robot(motion_from_record(published["msg"], "it"), PANDA).motion
+    assert published["msg"] == recorded_motion.joint_trajectory(trajectory)
+    found = recorded_motion.motion_of_robot(recorded_motion.motion_from_record(published["msg"], "it"), PANDA).motion
     np.testing.assert_array_equal(found.positions, trajectory.positions)
 
 
 def test_no_rosbridge_is_one_line() -> None:
-    refuses(r"no rosbridge answers at 127\.0\.0\.1:1 within 1 s", publish, MOTION, "127.0.0.1", 1, "/a", 1.0)
+    refuses(r"no rosbridge answers at 127\.0\.0\.1:1 within 1 s", recorded_motion.publish, MOTION, "127.0.0.1", 1, "/a", 1.0)
 
 
 def test_a_bag_replaces_a_link_to_one(tmp_path: Path) -> None:

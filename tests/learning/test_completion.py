@@ -11,36 +11,23 @@ import robotdiffuse as rd
 from helpers.panda import HOME, PANDA
 from helpers.refusals import refuses
 from helpers.trainings import trained
+from robotdiffuse.learning import completion
 from robotdiffuse.learning.checkpoint import load_completion, save_network
-from robotdiffuse.learning.completion import (
-    FREE,
-    OCCUPIED,
-    CompletionSettings,
-    Samples,
-    draw_samples,
-    exported_completion,
-    pack,
-    pack_fine,
-    predict,
-    reachable,
-    unpack_fine,
-    voxel_centers,
-)
 from robotdiffuse.learning.completion_network import CompletionNetwork, folded, unfolded
-from robotdiffuse.learning.training import completion
+from robotdiffuse.learning.training import completion as training
 from robotdiffuse.perception.observed_volume import ObservedVolume, observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.voxel_grid import FINE, SHAPE, refined
 from robotdiffuse.problems.families import FAMILIES, load_family
 
-SMALL = CompletionSettings(channels=(8, 8, 8), blocks=(1, 1, 1))
-TINY = completion.CompletionTraining(samples=8, batch=2, workers=0, network=SMALL, families=("rop", "table"))
+SMALL = completion.CompletionSettings(channels=(8, 8, 8), blocks=(1, 1, 1))
+TINY = training.CompletionTraining(samples=8, batch=2, workers=0, network=SMALL, families=("rop", "table"))
 
 
 @pytest.fixture(autouse=True)
 def few_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("VALIDATION_SAMPLES", "CALIBRATION_SAMPLES", "TEST_SAMPLES"):
-        monkeypatch.setattr(completion, name, 1)
+        monkeypatch.setattr(training, name, 1)
 
 
 def seen_from_behind(scene: rd.Scene) -> ObservedVolume:
@@ -50,29 +37,29 @@ def seen_from_behind(scene: rd.Scene) -> ObservedVolume:
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_samples_agree_with_the_scene(family: str) -> None:
-    samples = draw_samples((family,), PANDA, range(4))
-    truth = unpack_fine(samples.truth)
-    free = (samples.seen & FREE) > 0
-    occupied = (samples.seen & OCCUPIED) > 0
+    samples = completion.draw_samples((family,), PANDA, range(4))
+    truth = completion.unpack_fine(samples.truth)
+    free = (samples.seen & completion.FREE) > 0
+    occupied = (samples.seen & completion.OCCUPIED) > 0
     assert free.mean() > 0.05 and truth[free].mean() < 1e-3
     assert truth[occupied].any(axis=-1).mean() > 0.85, "the rest touch a corner"
     assert (samples.behind[free | occupied] == 0).all()
 
 
 def test_training_begins_with_the_weights_that_it_is_given() -> None:
-    settings = replace(TINY, network=CompletionSettings(), weights="bundled")
-    task = completion.CompletionTask(settings, completion.Processes("cpu"))
+    settings = replace(TINY, network=completion.CompletionSettings(), weights="bundled")
+    task = training.CompletionTask(settings, training.Processes("cpu"))
     given = load_completion().state_dict()
     assert all(torch.equal(value, given[name]) for name, value in task.module.state_dict().items())
     with pytest.raises(rd.InputError, match="weights bundled are of a network of"):
-        completion.CompletionTask(replace(TINY, weights="bundled"), completion.Processes("cpu"))
+        training.CompletionTask(replace(TINY, weights="bundled"), training.Processes("cpu"))
     refuses(r"families.*rap.*crate", replace, TINY, families=("rap",))
 
 
 def test_voxels_pack_and_unpack() -> None:
     scene = load_family("table").scene(np.random.default_rng(0))
     fine = voxels_within(scene, FINE)
-    bits = unpack_fine(pack_fine(fine))
+    bits = completion.unpack_fine(completion.pack_fine(fine))
     for place in np.argwhere(bits.any(axis=-1))[::97]:
         for bit in range(8):
             offset = (bit >> 2, bit >> 1 & 1, bit & 1)
@@ -88,42 +75,40 @@ def test_folding_and_unfolding_are_inverse() -> None:
 
 def test_the_network_s_inputs() -> None:
     volume = seen_from_behind(rd.Scene([rd.Box((0.5, 0.0, 0.3), (0.1, 0.6, 0.6))]))
-    seen, behind = (torch.from_numpy(array)[None] for array in pack(volume))
-    network = CompletionNetwork(SMALL)
-    inputs = network.features(seen, behind)[0].reshape(7, 8, 28, 28, 16).permute(0, 2, 3, 4, 1)
+    seen, behind = (torch.from_numpy(array)[None] for array in completion.pack(volume))
+    inputs = CompletionNetwork(SMALL).features(seen, behind)[0].reshape(7, 8, 28, 28, 16).permute(0, 2, 3, 4, 1)
     planes = [unfolded(plane[None])[0, ..., 0].numpy() for plane in inputs]
     for plane, of in zip(planes, (volume.occupied, volume.free, volume.shadow, volume.out_of_view), strict=False):
         assert (plane == of).all() and of.any()
     np.testing.assert_allclose(planes[4], volume.behind / 0.5, atol=0.011)
-    np.testing.assert_allclose(planes[5], voxel_centers()[..., 2], atol=1e-6)
-    np.testing.assert_allclose(planes[6], np.hypot(*np.moveaxis(voxel_centers()[..., :2], -1, 0)), atol=1e-6)
+    np.testing.assert_allclose(planes[5], completion.voxel_centers()[..., 2], atol=1e-6)
+    np.testing.assert_allclose(planes[6], np.hypot(*np.moveaxis(completion.voxel_centers()[..., :2], -1, 0)), atol=1e-6)
 
 
 @pytest.mark.slow
 def test_voxels_of_predictions_and_samples_agree(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    settings = replace(TINY, learning_rate=1e-2)
-    task = completion.CompletionTask(settings, completion.Processes("cpu"))
+    task = training.CompletionTask(replace(TINY, learning_rate=1e-2), training.Processes("cpu"))
     rng = np.random.default_rng(1)
     scene = load_family("table").scene(rng)
     volume = seen_from_behind(scene)
     fine = voxels_within(scene, FINE)
-    seen, behind = pack(volume)
-    sample = Samples(seen[None], behind[None], pack_fine(fine)[None])
+    seen, behind = completion.pack(volume)
+    sample = completion.Samples(seen[None], behind[None], completion.pack_fine(fine)[None])
     monkeypatch.setattr(task.prefetcher, "next", lambda rng: sample)
     losses = trained(task.module, lambda _: task.loss(0.0, rng), 60, 5e-3)
     assert losses[-1] < 0.3 * losses[0]
     save_network("completion", task.module, tmp_path, {})
-    p = predict(volume, exported_completion(tmp_path))
+    p = completion.predict(volume, completion.exported_completion(tmp_path))
     assert p.shape == tuple(2 * n for n in SHAPE) and p.dtype == np.float32
     free = refined(volume.free)
     assert (p[free] == 0).all()
-    counted = ~free & refined(reachable())
-    assert completion.average_precision(p[counted], fine[counted]) > 2 * fine[counted].mean()
+    counted = ~free & refined(completion.reachable())
+    assert training.average_precision(p[counted], fine[counted]) > 2 * fine[counted].mean()
 
 
 def test_training_writes_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(CompletionNetwork, "exports", lambda _: {})  # it takes seconds
-    report = completion.train_completion(replace(TINY, samples=2), str(tmp_path))
+    report = training.train_completion(replace(TINY, samples=2), str(tmp_path))
     loaded = load_completion(tmp_path)
     assert report["samples"] == 2 and loaded.settings == SMALL
     assert loaded.temperature == pytest.approx(report["temperature"])
@@ -132,15 +117,15 @@ def test_training_writes_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 
 @pytest.mark.slow
 def test_training_is_resumed_exactly_with_and_without_prefetching(tmp_path: Path) -> None:
-    report = completion.train_completion(TINY, str(tmp_path / "whole"))
-    completion.train_completion(replace(TINY, samples=4), str(tmp_path / "parts"))
-    again = completion.train_completion(TINY, str(tmp_path / "parts"))
+    report = training.train_completion(TINY, str(tmp_path / "whole"))
+    training.train_completion(replace(TINY, samples=4), str(tmp_path / "parts"))
+    again = training.train_completion(TINY, str(tmp_path / "parts"))
     assert again.keys() == report.keys() and report["samples"] == 8
     whole = load_completion(tmp_path / "whole")
     assert whole.temperature > 0 and not any(p.requires_grad for p in whole.parameters())
     rng = np.random.default_rng(2)
     other = np.random.default_rng(2)
-    ahead, alone = (completion.SamplePrefetcher(("rop",), PANDA, 2, workers) for workers in (1, 0))
+    ahead, alone = (training.SamplePrefetcher(("rop",), PANDA, 2, workers) for workers in (1, 0))
     for _ in range(3):
         a = ahead.next(rng)
         b = alone.next(other)
@@ -153,11 +138,11 @@ def test_temperature_and_calibration() -> None:
     rng = np.random.default_rng(4)
     logits = rng.normal(size=200_000).astype(np.float32) * 2
     truth = rng.random(len(logits)) < 1 / (1 + np.exp(-logits))
-    assert completion.fitted_temperature(3 * logits, truth) == pytest.approx(3, rel=0.03)
+    assert training.fitted_temperature(3 * logits, truth) == pytest.approx(3, rel=0.03)
     p = 1 / (1 + np.exp(-logits))
-    assert completion.calibration_error(p, truth) < 0.01 < 0.1 < completion.calibration_error(p**3, truth)
-    assert completion.average_precision(p, truth) == pytest.approx(completion.average_precision(p**3, truth))
-    assert completion.average_precision(np.array([0.9, 0.8, 0.1], np.float32), np.array([True, False, True])) == (
+    assert training.calibration_error(p, truth) < 0.01 < 0.1 < training.calibration_error(p**3, truth)
+    assert training.average_precision(p, truth) == pytest.approx(training.average_precision(p**3, truth))
+    assert training.average_precision(np.array([0.9, 0.8, 0.1], np.float32), np.array([True, False, True])) == (
         pytest.approx((1 + 2 / 3) / 2)
     )
 
@@ -165,21 +150,21 @@ def test_temperature_and_calibration() -> None:
 def test_nothing_is_predicted_beyond_reach() -> None:
     """Training has no voxels there, so the network would predict walls a meter around the arm."""
     unknown = np.zeros(SHAPE, np.uint8)
-    p = exported_completion()(unknown, unknown)
-    reach = refined(reachable())
+    p = completion.exported_completion()(unknown, unknown)
+    reach = refined(completion.reachable())
     assert not p[~reach].any() and p[reach].any()
 
 
 @pytest.mark.parametrize("family", ["rop_dense", "shelf", "kitchen"])
 def test_bundled_weights_are_better_than_a_constant(family: str) -> None:
     """Average precision over unknown voxels above the ground; that of a constant is the share of occupied voxels."""
-    samples = draw_samples((family,), PANDA, range(11, 19))
-    network = exported_completion()
-    above = voxel_centers()[..., 2] > 0.02
+    samples = completion.draw_samples((family,), PANDA, range(11, 19))
+    network = completion.exported_completion()
+    above = completion.voxel_centers()[..., 2] > 0.02
     p = [network(*volume) for volume in zip(samples.seen, samples.behind, strict=True)]
-    truth = unpack_fine(samples.truth)
-    counted = ((samples.seen & (FREE | OCCUPIED)) == 0) & reachable() & above
-    stated = np.stack([unpack_fine(pack_fine(one > 0.1)) for one in p])
+    truth = completion.unpack_fine(samples.truth)
+    counted = ((samples.seen & (completion.FREE | completion.OCCUPIED)) == 0) & completion.reachable() & above
+    stated = np.stack([completion.unpack_fine(completion.pack_fine(one > 0.1)) for one in p])
     called = stated[counted]
     true = truth[counted]
     assert called[true].mean() > 0.4, "recall"

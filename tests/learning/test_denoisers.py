@@ -91,8 +91,7 @@ def test_samples_of_a_batch_do_not_mix():
 
 
 def test_z_tk_as_a_token_only():
-    plain = replace(SMALL["transformer"], add_z_tk=False)
-    network = denoiser("transformer", settings=plain)
+    network = denoiser("transformer", settings=replace(SMALL["transformer"], add_z_tk=False))
     added = denoiser("transformer")
     added.load_state_dict(network.state_dict())
     assert not torch.allclose(network(*inputs()), added(*inputs()))

@@ -278,8 +278,7 @@ def test_a_frozen_encoder_stays_as_it_is(name, data, tmp_path):
 
 def test_batches_with_clouds_instead_of_codes(data):
     arm = box_arm()
-    encoder = small("dgcnn")
-    settings = MotionModelSettings(encoder="dgcnn", encoder_settings=encoder.settings)
+    settings = MotionModelSettings(encoder="dgcnn", encoder_settings=small("dgcnn").settings)
     model = MotionNetwork(RobotIdentity.of(arm), settings)
     kept = load_data(str(data), arm, None, settings.waypoints, lambda text: None)
     assert kept.embeddings is None

@@ -190,6 +190,5 @@ def test_steps_go_down_until_all_waypoints_keep_it(constraint: Constraint) -> No
 
 
 def test_steps_are_no_longer_than_pushes() -> None:
-    guidance = CollisionGuidance(NO_OBSTACLES, NO_OTHERS, ready(EACH[2]), 0.95)
-    moved, _ = guidance(waves(), 1)
+    moved, _ = CollisionGuidance(NO_OBSTACLES, NO_OTHERS, ready(EACH[2]), 0.95)(waves(), 1)
     assert np.linalg.norm(moved - waves(), axis=2).max() <= NO_OTHERS.push * (1 + 1e-6)

@@ -30,8 +30,7 @@ def best_predictor(schedule: NoiseSchedule) -> Callable[[np.ndarray, int], np.nd
 
 
 def exact_moments(name: str, schedule: NoiseSchedule, steps: int, eta: float) -> tuple[np.ndarray, np.ndarray]:
-    """Exact mean and covariance of the samples. A sample is an affine function of the drawn noises, so two
-    kinds of samples determine both: without noise, and with a unit in one component of one draw."""
+    """Mean and covariance of the samples, affine functions of the noises drawn: from none, and from a unit in one component."""
     draws = 0
     impulses = np.zeros((1 + 2 * (steps + 1), steps + 1, 2))
     impulses[1:] = np.eye(2 * (steps + 1)).reshape(-1, steps + 1, 2)
@@ -60,8 +59,7 @@ def test_stochastic_samples_have_the_data_s_moments(name):
 @pytest.mark.parametrize("name", SAMPLERS)
 @pytest.mark.parametrize("steps", [1, 2, 3, 200])
 def test_calls_of_the_predictor(name, steps):
-    """One call per step, from the last level downwards. All values are finite, also between levels of equal
-    noise, for any output of the predictor. The result is the last prediction."""
+    """One call per step, from the last level downwards, and values that are finite for any output; the last is the result."""
     schedule = cosine_schedule()
     rng = np.random.default_rng(0)
     levels = []
@@ -97,8 +95,7 @@ def our_steps(name: str, schedule: NoiseSchedule, steps: int, eta: float) -> np.
         found.append(x)
         return network(x, level)
 
-    sample = SAMPLERS.load(name)(predict, schedule, draws.__next__, steps, eta)
-    return np.array([*found, sample])
+    return np.array([*found, SAMPLERS.load(name)(predict, schedule, draws.__next__, steps, eta)])
 
 
 def their_steps(levels: list[int], scheduler, variance_noise: bool, **settings) -> np.ndarray:

@@ -1,5 +1,4 @@
-"""The check of a camera by the arm in its image, drawn by balls on its meshes; poses refined by the images: errors that were
-added to true poses are found."""
+"""The check of a camera by the arm in its image, and poses refined by images: errors added to true poses are found."""
 
 import re
 from dataclasses import replace

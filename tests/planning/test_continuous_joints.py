@@ -56,8 +56,7 @@ def test_values_wrapped_to_half_a_turn_are_no_motion_but_those_of_a_file_are_unw
     problem = rd.Problem(ARM, rd.Scene(), [3.0, 0.0, 0.0], [-3.0, 0.0, 0.0])
     motion = rd.load_planner("aorrtc").plan(problem).trajectory
     wrapped = (motion.positions + np.pi) % (2 * np.pi) - np.pi
-    timed = replace(motion, positions=wrapped)
-    for rows in (rd.Path(ARM.joint_names, wrapped), timed):
+    for rows in (rd.Path(ARM.joint_names, wrapped), replace(motion, positions=wrapped)):
         violation = rd.verify(problem, rows).violation
         assert violation.kind == "jump" and violation.subject == "j0"
         assert "unwrap" in violation.message

@@ -1,5 +1,4 @@
-"""Straight lines of the tool: motions lie on the lines at every millisecond, by forward kinematics of the cubics
-through the rows; if a line cannot be followed to its end, the result says where it ends and why."""
+"""Straight lines of the tool: motions lie on them at every millisecond, or the result says where a line ends and why."""
 
 import numpy as np
 import pytest
@@ -27,8 +26,7 @@ def moved(xyz: list[float], axis: list[float] | None = None, angle: float = 0.0)
 def planned(T_end: np.ndarray, scene: rd.Scene | None = None, **options) -> rd.PlanResult:
     line = options.pop("line", rd.CartesianLine(HAND))
     goal = options.pop("goal", rd.PoseGoal(HAND, T_end))
-    problem = rd.Problem(PANDA, scene or rd.Scene(), START, goal, constraints=[line])
-    return rd.plan(problem, **options)
+    return rd.plan(rd.Problem(PANDA, scene or rd.Scene(), START, goal, constraints=[line]), **options)
 
 
 LINES = {

@@ -89,8 +89,7 @@ def test_the_default_planner_is_aorrtc_and_needs_no_weights() -> None:
 def test_warming_up_loads_what_a_plan_needs_by_default() -> None:
     # it ended at first paths, and the first plan then compiled the search for the fastest motion (10 s)
     assert inspect.signature(Planner.warm_up).parameters["until"].default == PlanRequest().until
-    problem = rd.Problem(PANDA, rd.Scene([]), HOME, GOAL)
-    results = rd.load_planner("aorrtc").warm_up(problem)
+    results = rd.load_planner("aorrtc").warm_up(rd.Problem(PANDA, rd.Scene([]), HOME, GOAL))
     rows = [len(result.path.positions) for result in results if result.path]
     assert rows[0] == 2 and max(rows) > 2, "balls in the way make corners"
 
@@ -107,6 +106,5 @@ def test_at_most_nine_functions_lead_to_the_search(monkeypatch: pytest.MonkeyPat
         return search(*arguments)
 
     monkeypatch.setattr(rrt_kernel, "search", measured)
-    wall = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8])])
-    assert rd.plan(rd.Problem(PANDA, wall, LEFT, RIGHT)).solved
+    assert rd.plan(rd.Problem(PANDA, rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8])]), LEFT, RIGHT)).solved
     assert depths and max(depths) <= 9

@@ -1,5 +1,4 @@
-"""Poses as goals: the nearest configuration, tolerances for arms of few joints, several goals. Goals with a pose
-for each of several links: inverse kinematics, validation, files."""
+"""Poses as goals: the nearest configuration, tolerances for arms of few joints, several goals, poses of several links."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -220,8 +219,7 @@ def test_a_pose_nearby_is_reached_by_the_nearest_configuration(arm: str) -> None
 
 
 def four_joints(folder: Path) -> rd.Robot:
-    joints = chain("base", ["turn", "lift", "bend", "wrist"])
-    robot = read_urdf(written(folder, joints), tip="wrist_link")
+    robot = read_urdf(written(folder, chain("base", ["turn", "lift", "bend", "wrist"])), tip="wrist_link")
     balls = {link: np.array([[0.0, 0.0, 0.0, 0.045]]) for link in robot.meshes}
     neighbors = frozenset(frozenset((joint.parent, joint.child)) for joint in robot.joints)
     return replace(robot, spheres=balls, allowed_collisions=neighbors)

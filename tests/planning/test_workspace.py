@@ -113,8 +113,7 @@ def test_a_line_to_a_goal_with_tolerances_turns_no_more_than_it_must() -> None:
     less = space.plan_line(goal, HOME, time_limit=20.0)
     end = np.linalg.inv(goal.T_base_frame) @ space.pose(less.path.positions[-1])
     assert np.arctan2(end[1, 0], end[0, 0]) == pytest.approx(-0.2, abs=1e-3)
-    problem = rd.Problem(space.robot, space.scene, HOME, goal)
-    assert rd.verify(problem, less.trajectory).valid
+    assert rd.verify(rd.Problem(space.robot, space.scene, HOME, goal), less.trajectory).valid
 
 
 @pytest.mark.parametrize(("way", "turn", "angle"), [(0.0, 0.0, None), (0.0, 0.5, 0.05), (0.0, 0.5, None), (0.0005, 0.0, 0.05)])
@@ -225,8 +224,7 @@ def test_grasps_whose_line_is_blocked_are_left_for_others() -> None:
     space = table_with_can()
     for side in (-1, 1):
         space.add(rd.Box([0.5, -0.3 + side * 0.075, 0.09], [0.2, 0.02, 0.18], name=f"wall {side}"))
-    turns = [0.0, 0.2, np.pi / 2]
-    grasps = [GRASP @ rd.pose([0.0, 0.0, -0.12], rpy=[0.0, 0.0, turn]) for turn in turns]
+    grasps = [GRASP @ rd.pose([0.0, 0.0, -0.12], rpy=[0.0, 0.0, turn]) for turn in [0.0, 0.2, np.pi / 2]]
     result = space.plan_steps(pick(grasps), "ready", time_limit=60.0)  # type: ignore[arg-type]
     assert result.solved, result.reason
     assert result.goal_index("approach") == 2

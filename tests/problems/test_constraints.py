@@ -141,8 +141,7 @@ def test_speeds_are_finite_differences() -> None:
 @pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)
 def test_constraints_move_with_the_world_and_survive_files(constraint: Constraint, tmp_path: Path) -> None:
     T = transform(np.array([0.3, -2.0, 0.7]), rotation_about(np.array([0.6, 0.0, 0.8]), 1.0))
-    there = constraint.moved(T)
-    made = rd.Problem.in_world(T, PANDA, rd.Scene(), START, GOAL, constraints=[there])
+    made = rd.Problem.in_world(T, PANDA, rd.Scene(), START, GOAL, constraints=[constraint.moved(T)])
     q = np.random.default_rng(5).uniform(PANDA.lower, PANDA.upper, (5, 7))
     values = PathConstraints(problem(constraint)).values(q)
     np.testing.assert_allclose(PathConstraints(made).values(q), values, atol=1e-9)

@@ -62,8 +62,7 @@ def test_a_box_of_positions_is_reached_where_its_middle_is_blocked() -> None:
     blocked = rd.Problem(ROBOT, rd.Scene([POST]), START, rd.PoseGoal("panda_hand", AHEAD))
     assert rd.plan(blocked).status is rd.Status.INVALID_GOAL
     wide = rd.PoseGoal("panda_hand", AHEAD, [0.0, 0.35, 0.0], [0.0, 0.0, np.pi])
-    problem = rd.Problem(ROBOT, rd.Scene([POST]), START, wide)
-    result = rd.plan(problem, time_limit=10.0)
+    result = rd.plan(rd.Problem(ROBOT, rd.Scene([POST]), START, wide), time_limit=10.0)
     assert result.path is not None, result.reason
     T = inverse(AHEAD) @ link_pose(ROBOT, result.path.positions[-1], "panda_hand")
     assert np.abs(T[[0, 2], 3]).max() < 1e-5 and abs(T[1, 3]) < 0.35

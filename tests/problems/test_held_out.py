@@ -71,8 +71,7 @@ def test_line_that_was_cut_off_is_made_again(tmp_path: Path) -> None:
     whole = CaseFile(file).held_out("rop", 3, referee.validator)
     text = file.read_text()
     file.write_text(text[:-20])
-    again = CaseFile(file).held_out("rop", 3, referee.validator)
-    assert names(again) == names(whole) and file.read_text() == text
+    assert names(CaseFile(file).held_out("rop", 3, referee.validator)) == names(whole) and file.read_text() == text
     assert len(referee.validated) == 4
 
 

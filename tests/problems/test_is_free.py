@@ -67,8 +67,7 @@ def seen() -> rd.DepthView:
     """A depth view of a box beside the arm, from a camera in front of the arm."""
     camera = looking_at(np.array([1.7, 0.0, 0.6]), np.array([0.4, 0.0, 0.3]))
     lens = (75.0, 75.0, 39.5, 29.5)
-    box = rd.Box([0.0, -0.8, 0.3], [0.2, 0.2, 0.6])
-    return ray_cast(rd.Scene([box]), camera, lens, (80, 60), PANDA, HOME)
+    return ray_cast(rd.Scene([rd.Box([0.0, -0.8, 0.3], [0.2, 0.2, 0.6])]), camera, lens, (80, 60), PANDA, HOME)
 
 
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
@@ -107,8 +106,7 @@ def test_a_depth_image_in_millimeters_is_noted() -> None:
 
 
 def test_what_views_see_in_reach_is_no_scene_beyond_it() -> None:
-    far = rd.Scene([rd.Sphere([0, 5, 0], 0.2)])
-    problem = rd.Problem(PANDA, far, HOME, TO, views=[seen()], unknown="padded")
+    problem = rd.Problem(PANDA, rd.Scene([rd.Sphere([0, 5, 0], 0.2)]), HOME, TO, views=[seen()], unknown="padded")
     notes = rd.load_planner("aorrtc").plan(problem).notes
     assert all(note.startswith("compiled for") for note in notes), notes
 

@@ -64,8 +64,7 @@ def test_joints_that_turn_twice_are_drawn_without_needless_turns() -> None:
 
 
 def test_a_pose_does_not_say_how_often_a_joint_turns() -> None:
-    """Regression: one random problem in ten was unsolvable for a UR even without obstacles. Its upper arm hung
-    down beside the base, and only the equivalent goal one turn further can be reached, over the top."""
+    """Regression: one random problem in ten was unsolvable for a UR: only the goal one turn further can be reached."""
     robot = load_robot("ur5e")
     home = np.array([0, -1.57, 1.57, -1.57, -1.57, 0])
     start = np.array([0.5, 2.9, 0.7, 0.4, 2.7, 0.2])

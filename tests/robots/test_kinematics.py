@@ -120,8 +120,7 @@ def sampled_radii(robot: Robot, count: int) -> np.ndarray:
     frames = ForwardKinematics(robot, torch.float64)(torch.tensor(q)).numpy()
     out = np.zeros((len(robot.spheres), robot.dof))
     for i, link in enumerate(link for link in robot.link_names if link in robot.spheres):
-        last = robot.link_frame(link)
-        T_base_link = frames[:, last] @ robot.T_frame_link(link)
+        T_base_link = frames[:, robot.link_frame(link)] @ robot.T_frame_link(link)
         spheres = robot.spheres[link]
         points = np.einsum("nik,sk->nsi", T_base_link[:, :3, :3], spheres[:, :3]) + T_base_link[:, None, :3, 3]
         for j in robot.chain(link):

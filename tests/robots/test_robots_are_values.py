@@ -38,8 +38,7 @@ def test_equal_locked_values_are_one_robot() -> None:
     assert both is not panda.with_locked({LEFT: 0.01, RIGHT: 0.03})
     assert both.with_locked(panda.locked) is panda is panda.with_locked({}) is rd.load_robot("panda")
     assert both.locked == {LEFT: 0.01, RIGHT: 0.02} and both.unlocked is panda
-    moved = replace(panda, tip="panda_link7")
-    assert moved.with_locked({LEFT: 0.01, RIGHT: 0.02}) is not both
+    assert replace(panda, tip="panda_link7").with_locked({LEFT: 0.01, RIGHT: 0.02}) is not both
 
 
 def test_a_folder_that_changes_is_read_again(tmp_path: Path) -> None:

@@ -99,8 +99,7 @@ def test_spheres_parts_and_the_arms_of_one_robot_agree() -> None:
 def test_the_other_arm_keeps_its_values_in_inverse_kinematics() -> None:
     robot = two_arms()
     rng = np.random.default_rng(1)
-    q = rng.uniform(robot.lower, robot.upper)
-    T = link_pose(robot, q, "right_lower")
+    T = link_pose(robot, rng.uniform(robot.lower, robot.upper), "right_lower")
     rest = rng.uniform(robot.lower, robot.upper)
     found = inverse_kinematics(robot, "right_lower", T, 3, rng=rng, rest=rest)
     assert len(found) and len(robot.chain("right_lower")) == 3
@@ -165,8 +164,7 @@ def test_a_locked_arm_weighs_as_much_as_one_that_stands_still() -> None:
     v[0, rows], a[0, rows] = rng.normal(size=(2, len(rows)))
     left = both.with_locked(dict(zip(both.joint_names[4:], q[0, 4:], strict=True)))
     whole = Dynamics(both, Payload(0.0))
-    part = Dynamics(left, Payload(0.0))
-    expected = part.torques(q[:, rows], v[:, rows], a[:, rows])
+    expected = Dynamics(left, Payload(0.0)).torques(q[:, rows], v[:, rows], a[:, rows])
     np.testing.assert_allclose(whole.torques(q, v, a)[:, rows], expected, atol=1e-9)
 
 

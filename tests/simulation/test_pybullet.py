@@ -1,5 +1,4 @@
-"""PyBullet, which shares no code with ours: replays of motions and the command `simulate`; its distances and verdicts must
-agree with Coal and with the validator."""
+"""PyBullet, which shares no code with ours: replays, the command `simulate`; distances and verdicts agree with Coal."""
 
 import sys
 from dataclasses import replace

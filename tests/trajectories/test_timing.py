@@ -209,9 +209,7 @@ def test_a_limit_of_jerk_is_kept_with_the_others(seed: int, count: int, jerk: fl
     scale=st.floats(0.1, 1.0),
     ratio=st.floats(0.01, 0.99),
 )
-def test_a_motion_from_a_start_velocity_keeps_all_limits_and_need_not_stop(
-    seed: int, jerk: float, scale: float, ratio: float
-) -> None:
+def test_motions_from_a_start_velocity_keep_all_limits(seed: int, jerk: float, scale: float, ratio: float) -> None:
     """Checks velocities, accelerations and jerks every ms, first along a straight line and then around a corner."""
     robot = arm()
     rng = np.random.default_rng(seed)
@@ -233,8 +231,7 @@ def test_a_motion_from_a_start_velocity_keeps_all_limits_and_need_not_stop(
 
 
 def test_a_limit_of_jerk_costs_what_it_must() -> None:
-    """One joint needs at least (32 d / j)^(1/3) for a distance d at jerk j. Regression: accelerations of seven
-    fixed fractions of the limits took 20 times that. A high jerk limit costs at most one row."""
+    """One joint needs (32 d / j)^(1/3). Regression: accelerations of seven fixed fractions of the limits took 20 times that."""
     robot = arm((20.0,), (80.0,))
     free, slight, *gentle = (
         timed([[0.0], [1.0]], settings=TimingSettings(jerk=jerk), robot=robot).duration
@@ -324,8 +321,7 @@ def test_a_slow_torso_has_a_timing() -> None:
 )
 @example(seed=930, dof=8, count=7, scale=0.0, decades=4.0, kind="random")
 def test_every_path_has_a_timing(seed: int, dof: int, count: int, scale: float, decades: float, kind: str) -> None:
-    """For any limits, speeds at the grid points are within the limits and above 0 except at both ends. They are
-    not below toppra's, except where toppra's speeds fall to nearly 0 on the way."""
+    """Within the limits, above 0 except at both ends, and not below toppra's, except where those fall to nearly 0."""
     rng = np.random.default_rng(seed)
     velocity, acceleration = 10 ** rng.uniform(-decades / 2, decades / 2, (2, dof))
     q = np.cumsum(10**scale * rng.normal(0, 1, (count, dof)), axis=0)
@@ -453,8 +449,7 @@ FAR, NEAR = np.array([3.0, 1.0]), np.array([0.1, -0.05])
 def test_the_time_of_a_line_by_hand():
     one = np.ones(2)
     goals = np.stack([FAR, NEAR, START])
-    expected = [3.0 + 1.0, 2 * np.sqrt(0.1), 0.0]
-    assert np.allclose(straight_line_time(START, goals, one, one), expected)
+    assert np.allclose(straight_line_time(START, goals, one, one), [3.0 + 1.0, 2 * np.sqrt(0.1), 0.0])
     # the slowest joint at each limit decides: times 1 / v, 1 / a of the share of the way
     assert np.isclose(straight_line_time(START, FAR, np.array([6.0, 0.5]), np.array([3.0, 1.0])), 2.0 + 0.5)
     # the greatest jerk alone binds in short motions

@@ -78,9 +78,7 @@ def test_an_empty_scene_and_a_motion_of_one_waypoint() -> None:
 
 
 @given(st.floats(0.02, 0.98), st.floats(0.25, 1.1), st.floats(0.0005, 0.01), st.integers(0, 3), st.booleans())
-def test_a_thin_wall_between_two_waypoints_is_found(
-    share: float, reach: float, thickness: float, extra: int, spheres: bool
-) -> None:
+def test_thin_walls_on_the_way_are_found(share: float, reach: float, thickness: float, extra: int, spheres: bool) -> None:
     """A straight arm swings through a wall that coarse sampling may miss."""
     angle = -1 + 2 * share
     turn = vector(np.cos(angle / 2), 0, 0, np.sin(angle / 2))
@@ -290,8 +288,7 @@ def test_wrong_shapes_of_a_trajectory_raise() -> None:
 
 @pytest.mark.parametrize(("factor", "jumps"), [(1.0, False), (1.02, False), (1.49, False), (1.6, True)])
 def test_times_compressed_under_rates_of_zero(factor: float, jumps: bool) -> None:
-    """If the velocities and accelerations of a trajectory are too small for its positions, they are computed
-    again. With its own velocities, this motion stops at each row."""
+    """Velocities and accelerations too small for the positions are computed anew; by its own, this motion stops at each row."""
     good = trajectory(1.5 * 1.2 / 2.0 * 1.0001)  # as fast as the limit of 2 rad/s allows
     assert verified(good, robot=strong(1e3)).valid
     still = np.zeros_like(good.velocities)

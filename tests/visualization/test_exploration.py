@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import robotdiffuse as rd
 from helpers.browsers import CHROMIUM, opened
 from helpers.explorations import FLOOR, recorded
 from helpers.pages import page_data
+from helpers.refusals import refuses
 from robotdiffuse.perception.voxel_grid import MAP
 from robotdiffuse.visualization import exploration
 from robotdiffuse.visualization.picture import PictureSettings
@@ -51,8 +51,7 @@ def test_each_moment_has_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     blue = (first[..., 2] > first[..., 0] + 25).sum()
     assert blue > 50, "the wall was seen"
     for write, ending in ((exploration.write_exploration_picture, "html"), (exploration.write_exploration, "png")):
-        with pytest.raises(rd.InputError):
-            write(explorer, problem.scene, tmp_path / f"explore.{ending}")
+        refuses("", write, explorer, problem.scene, tmp_path / f"explore.{ending}")
 
 
 @pytest.fixture(scope="module")

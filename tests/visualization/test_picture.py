@@ -24,8 +24,7 @@ def test_picture_shows_the_tip_where_kinematics_puts_it(arm, motion, tmp_path):
     assert away.shape == (200, 320, 3) and 0 < column < 320 and 0 < row < 200
     patch = pixels[row - 2 : row + 3, column - 2 : column + 3].reshape(-1, 3).astype(int)
     assert np.ptp(patch, axis=1).max() < 60, "the arm is gray; the trace ends beyond the middle of the tip"
-    background = pixels[3, 3].astype(int)
-    assert np.abs(patch - background).max() > 12
+    assert np.abs(patch - pixels[3, 3].astype(int)).max() > 12
     write_picture(arm, Scene(), motion, tmp_path / "motion.png", settings=SMALL)
     with Image.open(tmp_path / "motion.png") as image:
         assert image.format == "PNG" and image.size == (320, 200)

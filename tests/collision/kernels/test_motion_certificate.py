@@ -79,8 +79,7 @@ def test_planes_part_as_far_as_coal_says(name: str, seed: int) -> None:
     posture = convex_bounds.make_posture(arm, arrays, robot.dof)
     slides = np.array(robot.prismatic, np.bool_)
     offsets = robot.frame_offsets.copy()
-    parents = robot.kernel_parents
-    convex_bounds.pose(offsets, parents, slides, q, np.zeros(robot.dof), posture)
+    convex_bounds.pose(offsets, robot.kernel_parents, slides, q, np.zeros(robot.dof), posture)
     for found in exact.link_distances(q):
         guess = rng.normal(size=3)
         planes = [

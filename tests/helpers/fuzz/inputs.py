@@ -1,7 +1,6 @@
 """Damaged inputs of seventeen kinds: each must give an answer or a one-line error, in bounded time.
 
-An input is a kind and a seed; `outcome_of(kind, seed, folder)` makes the same one again. Texts are changed value by value, line
-by line or byte by byte, all others by bytes. `benchmarks/robustness.py` runs as many as there is time for.
+An input is a kind and a seed; `outcome_of(kind, seed, folder)` makes the same one again.
 """
 
 import copy

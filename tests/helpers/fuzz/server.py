@@ -1,9 +1,7 @@
 """The kind `socket`: damaged requests to a running `robotdiffuse serve`, over its socket.
 
-Within LIMIT, the server must answer each request with 2xx, 4xx or 503, with errors as one line of JSON; it
-may close the connection instead if the request was never complete. From time to time, a valid request must
-get the same answer as at first; the server must then hold no further requests or connections and no more
-memory than before. This server has shorter timeouts for clients than `robotdiffuse serve`, to save time.
+Each is answered within LIMIT, with errors as one line of JSON, or was never complete and the connection is closed. From time to
+time, a valid request gets the same answer as at first, and the server then holds nothing further and no more memory.
 """
 
 import atexit
@@ -29,8 +27,7 @@ CLIENT_TIMEOUT = 0.5
 ACCESS = re.compile(r" \d{3} \d+\.\d{3} s ")
 """A line of the server's access log."""
 LIMIT = 12.0
-"""Most wall time until an answer is there or the connection is closed [s]: sending, the time limit of the
-call, and its grace."""
+"""Most wall time until an answer is there or the connection is closed [s], with the time limit of the call and its grace."""
 START_LIMIT = 60.0
 """The same for the first requests, which load compiled code [s]."""
 INPUTS_BETWEEN_CHECKS = 50
@@ -352,8 +349,7 @@ class Server:
 
 
 def _children(pid: int) -> list[int]:
-    found = FilePath(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    return [int(child) for child in found]
+    return [int(child) for child in FilePath(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 def _memory(pid: int) -> int:

@@ -59,8 +59,7 @@ def test_weights_of_another_robot_or_none_are_refused(data: str, tmp_path: Path)
         load_network("reversal", None, PANDA)
     with pytest.raises(rd.InputError, match="holds no reversal; train them: robotdiffuse train baseline reversal"):
         load_network("reversal", str(tmp_path), PANDA)
-    settings = baseline_training("reversal", {"data": data, "samples": 160})
-    train_baseline(settings, str(tmp_path / "out"))
+    train_baseline(baseline_training("reversal", {"data": data, "samples": 160}), str(tmp_path / "out"))
     narrow = PANDA.with_locked({"panda_joint7": 0.0})
     refuses("was trained for panda with joints", load_network, "reversal", str(tmp_path / "out"), narrow)
 

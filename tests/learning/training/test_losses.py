@@ -75,5 +75,4 @@ def test_surface_points_move_with_their_links() -> None:
 
 def test_the_collision_loss_begins_as_scheduled() -> None:
     settings = losses.LossSettings(collision=2.0, begin=0.5)
-    weights = [settings.collision_weight(f) for f in (0.0, 0.5, 0.55, 0.6, 1.0)]
-    assert weights == pytest.approx([0, 0, 1, 2, 2])
+    assert [settings.collision_weight(f) for f in (0.0, 0.5, 0.55, 0.6, 1.0)] == pytest.approx([0, 0, 1, 2, 2])

@@ -100,8 +100,7 @@ def test_a_stop_at_a_waypoint_is_not_gone_through() -> None:
     """The waypoint is on the straight line, so the motion would not stop by itself; a ball is at the waypoint first."""
     middle = (START + GOAL) / 2
     at = PANDA.fk(middle, "panda_hand")[:3, 3]
-    ball = rd.MovingObstacle(rd.Sphere(at, 0.08, name="ball"), velocity=[0.3, 0, 0.3])
-    task = problem(ball, waypoints=[middle])
+    task = problem(rd.MovingObstacle(rd.Sphere(at, 0.08, name="ball"), velocity=[0.3, 0, 0.3]), waypoints=[middle])
     found = rd.load_planner("rrt_connect").plan(task, 20.0)
     assert found.solved, found.reason
     assert rd.verify(task, found.trajectory).valid

@@ -155,12 +155,10 @@ def test_one_camera_that_sees_is_enough(planner: Planner) -> None:
 
 
 def test_the_default_policy_is_prediction_where_the_network_covers_the_reach() -> None:
-    problem = replace(partial("padded"), unknown=None)
-    assert unknown_space.policy_for(problem) == ("predicted", "")
+    assert unknown_space.policy_for(replace(partial("padded"), unknown=None)) == ("predicted", "")
     assert unknown_space.policy_for(partial("optimistic")) == ("optimistic", "")
     arm = rd.load_robot("ur10")
-    view = replace(taken(DEEP), configuration=None)
-    far = rd.Problem(arm, rd.Scene(), np.zeros(6), np.zeros(6), views=[view])
+    far = rd.Problem(arm, rd.Scene(), np.zeros(6), np.zeros(6), views=[replace(taken(DEEP), configuration=None)])
     policy, note = unknown_space.policy_for(far)
     assert policy == "padded" and "ur10 reaches farther" in note
 

@@ -1,5 +1,4 @@
-"""Planning under path constraints: motions keep the constraints at every millimeter, by kinematics that share
-no code with search and validator; starts and goals that violate a constraint are reported."""
+"""Planning under path constraints: motions keep them at every millimeter, by kinematics that share no code with the search."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -93,8 +92,7 @@ def test_speed_of_a_line_is_kept_and_used() -> None:
     at = PANDA.fk(t.positions, HAND)[:, :3, 3]
     speeds = np.linalg.norm(np.diff(at, axis=0), axis=1) / np.diff(t.times)
     assert speeds.max() <= 0.25 * 1.001 and np.median(speeds) >= 0.24
-    slower = problem([replace(LINE, speed=0.2)])
-    found = rd.verify(slower, t).violation
+    found = rd.verify(problem([replace(LINE, speed=0.2)]), t).violation
     assert found.kind == "speed" and "allows 0.2 m/s" in found.message
 
 
@@ -135,8 +133,7 @@ def test_more_iterations_give_no_slower_motion(case: int, monkeypatch: pytest.Mo
     durations = []
     for paths in (1, 2, 4, 8):
         monkeypatch.setattr(rrt, "PATHS_TO_FIND", paths)
-        result = rd.plan(problem(*CASES[case]), 60.0, planner="rrt_connect", seed=1)
-        durations.append(result.duration)
+        durations.append(rd.plan(problem(*CASES[case]), 60.0, planner="rrt_connect", seed=1).duration)
     assert durations == sorted(durations, reverse=True)
     assert durations[-1] < 0.95 * durations[0]
 

@@ -79,8 +79,7 @@ def test_rrt_star_alone_converges_to_the_optimum() -> None:
     # the grid's own error: 0.4 % of direction, and cells of 0.02 rad at the obstacle's edge
     assert 0.985 < costs[2] < 1.01
     # rounds with both get there quickly
-    settings = replace(TOUCHING, resolution=0.01)
-    search = SharedTreeSearch(checker, start, goal[None], settings, random_state(1))
+    search = SharedTreeSearch(checker, start, goal[None], replace(TOUCHING, resolution=0.01), random_state(1))
     for _ in range(40):
         search.round()
     assert 0.985 < search.cost / optimum < 1.01

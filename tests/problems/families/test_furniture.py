@@ -72,8 +72,7 @@ def test_furniture_is_as_its_settings_say(name: str) -> None:
             assert furniture.TABLE.height[0] <= tops[0] <= furniture.TABLE.height[1]
             assert furniture.TABLE.objects[0] <= len(things) <= furniture.TABLE.objects[1]
             assert all(thing.bounds[0, 2] == pytest.approx(tops[0]) for thing in things)
-        boards = named(furnished, "board")
-        assert (2 <= len(boards) <= 4) == (name == "shelf")
+        assert (2 <= len(named(furnished, "board")) <= 4) == (name == "shelf")
         for region in furnished.regions:
             down = bool((region.approach == [0, 0, -1]).all())
             assert down if name == "crate" else down or region.approach[2] == 0

@@ -230,8 +230,7 @@ def test_files_are_looked_up_from_the_problem(tmp_path: Path, monkeypatch: pytes
     assert len(loaded.notes) == 1 and "1 of 2 points are not finite" in loaded.notes[0]
     save_problem(loaded, tmp_path / "again.json")
     assert json.loads((tmp_path / "again.json").read_text())["scene"] == [entry]
-    record = problem_record(loaded)
-    assert problem_from_record(record).scene.shapes[0].area == loaded.scene.shapes[0].area
+    assert problem_from_record(problem_record(loaded)).scene.shapes[0].area == loaded.scene.shapes[0].area
 
 
 def test_moveit_files_in_a_problem(tmp_path: Path) -> None:

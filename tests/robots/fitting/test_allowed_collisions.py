@@ -56,8 +56,7 @@ def overlapping(lower: float, own: bool = True) -> Robot:
     cube = (box_mesh(np.full(3, -0.05), np.full(3, 0.05)),)
     tip = "c" if own else "m"
     ball = np.array([[0, 0, 0, 0.0867]])
-    spheres = {"a": ball, "c": ball}
-    return Robot("overlap", "a", tip, tuple(joints), spheres=spheres, meshes={"a": cube, "c": cube})
+    return Robot("overlap", "a", tip, tuple(joints), spheres={"a": ball, "c": ball}, meshes={"a": cube, "c": cube})
 
 
 def with_middle(robot: Robot) -> Robot:
@@ -70,8 +69,7 @@ def with_middle(robot: Robot) -> Robot:
 
 
 def carrying(held: dict[str, float] | None = None) -> Robot:
-    """A robot whose link m carries c and, behind a further joint, the hand. c is fixed to m or, with `held`,
-    connected by locked joints, as the bellows of the vendor's Fetch are to its lift."""
+    """Link m carries the hand on a joint, and c, fixed or by locked joints (`held`), as the vendor's Fetch its bellows."""
     robot = with_middle(overlapping(0.0, own=held is not None))
     z = np.array([0, 0, 1.0])
     turn = Joint("4", "revolute", "m", "hand", np.eye(4), z, -1.0, 1.0)
@@ -91,9 +89,8 @@ def tucked(bend: float) -> Robot:
 
 
 def thick(bound: float) -> Robot:
-    """An arm whose first and last link collide in half of a joint's range, as the meshes of Baxter's forearm
-    and wrist do, although the real links do not. The range is evidence of a stop only if the joint makes
-    less than a full turn."""
+    """An arm whose first and last link collide in half of a joint's range, as the meshes of Baxter's forearm and wrist do,
+    although the real links do not; the range is evidence of a stop only below a full turn."""
     wide = limited(box_arm(), bound)
     last = wide.joint_names[2]
     joints = tuple(replace(j, lower=-0.2, upper=0.2) if j.name == last else j for j in wide.joints)

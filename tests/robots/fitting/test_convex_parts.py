@@ -8,14 +8,7 @@ import trimesh
 
 from helpers.boxes import boxes, surface
 from robotdiffuse.robots.bodies import ConvexMesh
-from robotdiffuse.robots.fitting.convex_parts import (
-    PartSettings,
-    Surface,
-    convex_hull,
-    convex_parts,
-    planes_of,
-    simplified,
-)
+from robotdiffuse.robots.fitting import convex_parts
 
 L = boxes(((0, 0, 0), (0.3, 0.1, 0.1)), ((0, 0, 0.1), (0.1, 0.1, 0.4)))
 FRAME = boxes(
@@ -32,12 +25,12 @@ SLOW_MESHES = ("bowl", "tube")
 
 @cache
 def parts_of(name: str) -> tuple[ConvexMesh, ...]:
-    return convex_parts((surface(MESHES[name]),))
+    return convex_parts.convex_parts((surface(MESHES[name]),))
 
 
 def beyond(parts: tuple, points: np.ndarray) -> np.ndarray:
     """Largest distance of points from the nearest part."""
-    return np.min([(points @ n.T - o).max(1) for n, o in map(planes_of, parts)], axis=0)
+    return np.min([(points @ n.T - o).max(1) for n, o in map(convex_parts.planes_of, parts)], axis=0)
 
 
 @pytest.mark.parametrize(
@@ -45,8 +38,7 @@ def beyond(parts: tuple, points: np.ndarray) -> np.ndarray:
 )
 def test_parts_hold_all_of_the_mesh(name: str) -> None:
     parts = parts_of(name)
-    points = trimesh.sample.sample_surface(MESHES[name], 20_000, seed=1)[0]
-    assert beyond(parts, points).max() < 1e-9
+    assert beyond(parts, trimesh.sample.sample_surface(MESHES[name], 20_000, seed=1)[0]).max() < 1e-9
     for part in parts:
         solid = trimesh.Trimesh(part.vertices, part.faces, process=False)
         assert solid.is_convex and solid.is_watertight and solid.volume > 0
@@ -68,10 +60,10 @@ def test_a_frame_stays_open() -> None:
 
 def test_parts_stick_out_little_about_tight_places() -> None:
     """Parts may fill a wide hole within the tolerance, but not a hole near a tight place."""
-    coarse = PartSettings(concavity=0.2, voxels=20_000)
+    coarse = convex_parts.PartSettings(concavity=0.2, voxels=20_000)
     tight = np.array([[0.06, 0.05, 0.06]])
-    whole = convex_parts((surface(FRAME),), coarse)
-    parts = convex_parts((surface(FRAME),), coarse, tight)
+    whole = convex_parts.convex_parts((surface(FRAME),), coarse)
+    parts = convex_parts.convex_parts((surface(FRAME),), coarse, tight)
     assert len(whole) == 1 < len(parts)
     # an eighth of the tolerance, and a voxel: 0.034 m, from the frame's bars, which end at 0.05 m
     assert beyond(whole, tight + 0.03)[0] < 0 < beyond(parts, tight + 0.03)[0]
@@ -82,8 +74,8 @@ def test_parts_stick_out_little_about_tight_places() -> None:
 def test_simplified_hulls_hold_the_hull() -> None:
     points = np.random.default_rng(0).normal(size=(4000, 3))
     points *= np.array([0.1, 0.06, 0.08]) / np.linalg.norm(points, axis=1, keepdims=True)
-    hull = convex_hull(points)
-    few = simplified(hull)
+    hull = convex_parts.convex_hull(points)
+    few = convex_parts.simplified(hull)
     assert len(hull.faces) > 5000 and len(few.faces) <= 480
     assert beyond((few,), points).max() < 0
     assert beyond((hull,), few.vertices).max() < 0.004
@@ -91,7 +83,7 @@ def test_simplified_hulls_hold_the_hull() -> None:
 
 def test_most_parts_are_a_bound() -> None:
     comb = boxes(*(((0.04 * i, 0, 0), (0.04 * i + 0.01, 0.05, 0.1)) for i in range(12)))
-    parts = convex_parts((surface(comb),), PartSettings(most=5))
+    parts = convex_parts.convex_parts((surface(comb),), convex_parts.PartSettings(most=5))
     assert len(parts) <= 5
     assert beyond(parts, trimesh.sample.sample_surface(comb, 5000, seed=1)[0]).max() < 1e-9
 
@@ -99,10 +91,10 @@ def test_most_parts_are_a_bound() -> None:
 def test_the_order_of_triangles_does_not_matter() -> None:
     """Regression: with another order, a UR5 needed a second round of refinement."""
     bowl = surface(BOWL)
-    shuffled = Surface(bowl.vertices, np.random.default_rng(0).permutation(bowl.faces))
-    coarse = PartSettings(concavity=0.02, voxels=20_000)
+    shuffled = convex_parts.Surface(bowl.vertices, np.random.default_rng(0).permutation(bowl.faces))
+    coarse = convex_parts.PartSettings(concavity=0.02, voxels=20_000)
     found, other = (
-        sorted(tuple(part.vertices.min(axis=0).round(9)) for part in convex_parts((shape,), coarse))
+        sorted(tuple(part.vertices.min(axis=0).round(9)) for part in convex_parts.convex_parts((shape,), coarse))
         for shape in (bowl, shuffled)
     )
     assert len(found) > 1 and np.allclose(found, other, atol=1e-6)

@@ -302,8 +302,7 @@ def test_meshes_that_collide_are_hulls_as_for_mujoco(tmp_path: Path) -> None:
     faces = np.concatenate([legs[0].faces, legs[1].faces + len(legs[0].vertices)])
     numbers = (" ".join(map(str, values.ravel().tolist())) for values in (vertices, faces))
     (tmp_path / "m.xml").write_text(HOLLOW.format(*numbers))
-    tree = UrdfTree(tmp_path / "m.xml", {})
-    [surface] = tree.surfaces("base")
+    [surface] = UrdfTree(tmp_path / "m.xml", {}).surfaces("base")
     bounds = surface.vertices.max(axis=0) - surface.vertices.min(axis=0)
     volume = trimesh.Trimesh(surface.vertices, surface.faces).volume
     np.testing.assert_allclose(volume, np.prod(bounds), rtol=1e-6)

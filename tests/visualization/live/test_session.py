@@ -91,8 +91,7 @@ def test_the_target_is_dragged(session: live.Session) -> None:
 
     def stands(state: live.State) -> bool:
         q = state.goal_configuration
-        robot = state.problem.robot
-        return q is not None and np.allclose(robot.fk(q, state.goal_frame), T, atol=1e-5)
+        return q is not None and np.allclose(state.problem.robot.fk(q, state.goal_frame), T, atol=1e-5)
 
     state = until(session, lambda state: settled(state) and stands(state))
     assert state.answer is not None and state.answer.solved and live.validity(state).kind == live.VALID

@@ -1,5 +1,6 @@
 """MoveIt scenes, requests, joints and contacts: what is read, and what is refused rather than ignored."""
 
+import re
 import shutil
 from copy import deepcopy
 from pathlib import Path
@@ -16,18 +17,11 @@ from helpers.panda import PANDA
 from helpers.refusals import refuses
 from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_about, rotation_from_quaternion, transform
+from robotdiffuse.problems import moveit
 from robotdiffuse.problems.files import ProblemEntry, load_motion_bench_maker, load_problems, problem_record
-from robotdiffuse.problems.moveit import (
-    MoveItFrames,
-    matrix_contacts,
-    moveit_frames,
-    moveit_request,
-    moveit_scene,
-    read_moveit_scene,
-    scene_robot_notes,
-)
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
+from robotdiffuse.scenes.shapes import Shape
 
 MOTION_BENCH_MAKER = Path(__file__).parents[3] / "files" / "motion_bench_maker"
 QUARTER = [0, 0, 0.7071067811865476, 0.7071067811865476]
@@ -60,8 +54,12 @@ def change(data: dict[str, Any], path: list[Any], value: object) -> dict[str, An
     return data
 
 
+def shapes_of(data: dict[str, Any], robot: rd.Robot = PANDA, folder: Path = MOTION_BENCH_MAKER) -> tuple[Shape, ...]:
+    return moveit.moveit_scene(data, moveit.moveit_frames(data, robot), folder).shapes
+
+
 def test_scene_as_motion_bench_maker_writes_it() -> None:
-    can, board = read_moveit_scene(MOTION_BENCH_MAKER / "scene0001.yaml", PANDA)[0].shapes
+    can, board = moveit.read_moveit_scene(MOTION_BENCH_MAKER / "scene0001.yaml", PANDA)[0].shapes
     assert isinstance(can, rd.Cylinder) and (can.name, can.height, can.radius) == ("can", 0.14, 0.03)
     assert can.center.tolist() == [0.5, -0.4, 0.3]
     assert isinstance(board, rd.Box) and board.size.tolist() == [1.2, 0.8, 0.04]
@@ -102,7 +100,7 @@ def test_vectors_as_mappings_types_as_numbers_and_poses_of_the_object_alone() ->
         primitives=[{"type": 3, "dimensions": [0.4, 0.1]}],
         primitive_poses=[{"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}],
     )
-    [shape] = moveit_scene(data, moveit_frames(data, PANDA), Path()).shapes
+    [shape] = shapes_of(data)
     assert isinstance(shape, rd.Cylinder) and shape.center.tolist() == [1, 2, 3]
     assert (shape.name, shape.height, shape.radius) == ("3", 0.4, 0.1)
     entry = ball(pose={"position": [0, 0, 2], "orientation": [0, 0, 0, 1]})
@@ -122,7 +120,7 @@ def test_meshes(tmp_path: Path) -> None:
         ],
         mesh_poses=[at, at],
     )
-    triangle, cube = moveit_scene(data, moveit_frames(data, PANDA), tmp_path).shapes
+    triangle, cube = shapes_of(data, folder=tmp_path)
     assert isinstance(triangle, rd.Mesh) and isinstance(cube, rd.Mesh)
     np.testing.assert_allclose(triangle.world_vertices, [[0, 0, 1], [0, 1, 1], [-1, 0, 1]], atol=1e-12)
     np.testing.assert_allclose(cube.bounds, [[-0.5, -1, 0.5], [0.5, 1, 1.5]], atol=1e-12)
@@ -140,17 +138,13 @@ def octomap(data: list[int]) -> dict[str, object]:
 
 def test_cones_planes_and_octomaps() -> None:
     place = {"position": [1, 0, 0], "orientation": [0, 0, 0, 1]}
-    data = scene_data(**ball(primitives=[CONE], primitive_poses=[place]))
-    [cone] = moveit_scene(data, moveit_frames(data, PANDA), Path()).shapes
+    [cone] = shapes_of(scene_data(**ball(primitives=[CONE], primitive_poses=[place])))
     assert isinstance(cone, rd.Mesh)
     np.testing.assert_allclose(cone.bounds, [[0.9, -0.1, -0.2], [1.1, 0.1, 0.2]], atol=1e-3)
-    flat = {"id": "ground", "planes": [{"coef": [0, 0, 2, -1]}], "plane_poses": [place]}
-    data = scene_data(**flat)
-    [ground] = moveit_scene(data, moveit_frames(data, PANDA), Path()).shapes
+    [ground] = shapes_of(scene_data(id="ground", planes=[{"coef": [0, 0, 2, -1]}], plane_poses=[place]))
     assert isinstance(ground, rd.Box) and ground.name == "ground"
     np.testing.assert_allclose(ground.bounds[1], [11, 10, 0.5])
-    data = octomap([-1 & 3, 0] + 14 * [3, 0] + [2, 0])  # the voxel at the lower end of everything
-    [cloud] = moveit_scene(data, moveit_frames(data, PANDA), Path()).shapes
+    [cloud] = shapes_of(octomap([-1 & 3, 0] + 14 * [3, 0] + [2, 0]))  # the voxel at the lower end of everything
     assert isinstance(cloud, rd.PointCloud) and cloud.point_radius == pytest.approx(0.05 * 3**0.5)
     np.testing.assert_allclose(cloud.points, [np.array([0, 0, 1]) - 0.1 * (2**15 - 0.5)])
 
@@ -184,9 +178,7 @@ WRONG_SCENES: dict[str, tuple[object, str]] = {
 def test_wrong_scenes(data: object, message: str, tmp_path: Path) -> None:
     file = tmp_path / "scene.yaml"
     file.write_text(yaml.safe_dump(data))
-    with pytest.raises(rd.InputError, match=message) as raised:
-        read_moveit_scene(file, PANDA)
-    assert str(raised.value).startswith(str(file)) and "\n" not in str(raised.value)
+    refuses(f"^{re.escape(str(file))}.*{message}", moveit.read_moveit_scene, file, PANDA)
 
 
 LINKS = ("hand", "finger")
@@ -205,16 +197,16 @@ def matrix(names: list[str], pairs: list[tuple[str, str]], **defaults: bool) -> 
 
 def test_pairs_of_links_and_objects_count_and_defaults_decide_where_no_pair_does() -> None:
     names = ["hand", "finger", "can", "stale"]
-    found = matrix_contacts(matrix(names, [("hand", "can"), ("hand", "finger"), ("stale", "can")]), ["can", "board"], LINKS)
-    assert found == {"can": ("hand",)}
+    data = matrix(names, [("hand", "can"), ("hand", "finger"), ("stale", "can")])
+    assert moveit.matrix_contacts(data, ["can", "board"], LINKS) == {"can": ("hand",)}
     data = matrix(["hand", "can"], [], can=True, board=True, finger=False)
-    assert matrix_contacts(data, ["can", "board"], LINKS) == {"board": ("hand",)}
-    assert matrix_contacts(matrix([], [], can=True), ["can"], LINKS) == {"can": LINKS}
-    assert matrix_contacts(None, ["can"], LINKS) == {}
+    assert moveit.matrix_contacts(data, ["can", "board"], LINKS) == {"board": ("hand",)}
+    assert moveit.matrix_contacts(matrix([], [], can=True), ["can"], LINKS) == {"can": LINKS}
+    assert moveit.matrix_contacts(None, ["can"], LINKS) == {}
     rows = {"entry_names": ["hand", "<octomap>"], "entry_values": [[0, 1], [1, 0]]}
-    assert matrix_contacts(rows, ["octomap"], LINKS) == {"octomap": ("hand",)}
+    assert moveit.matrix_contacts(rows, ["octomap"], LINKS) == {"octomap": ("hand",)}
     for damaged in ({"entry_names": ["hand", "can"], "entry_values": [[0, 1]]}, {"entry_names": "hand"}, ["hand"]):
-        refuses("allowed_collision_matrix", matrix_contacts, damaged, ["can"], LINKS)
+        refuses("allowed_collision_matrix", moveit.matrix_contacts, damaged, ["can"], LINKS)
 
 
 def test_a_scene_and_a_problem_file_allow_contacts(tmp_path: Path) -> None:
@@ -224,7 +216,7 @@ def test_a_scene_and_a_problem_file_allow_contacts(tmp_path: Path) -> None:
     names = [entry["id"] for entry in data["world"]["collision_objects"]]
     data["allowed_collision_matrix"] = matrix(["panda_hand", names[0], "gone"], [("panda_hand", names[0])])
     file.write_text(yaml.safe_dump(data))
-    scene, _ = read_moveit_scene(file, PANDA)
+    scene, _ = moveit.read_moveit_scene(file, PANDA)
     assert scene.allowed_contacts == ((names[0], ("panda_hand",)),)
     problem = {"robot": "panda", "scene": "scene0001.yaml", "request": "request0001.yaml"}
     (tmp_path / "problem.yaml").write_text(yaml.safe_dump(problem | {"allowed_contacts": {names[1]: "all"}}))
@@ -256,13 +248,12 @@ def ur5_files(folder: Path, model: str, more: list[str]) -> Path:
 def test_files_of_another_robot_are_refused_by_its_joints(tmp_path: Path) -> None:
     """Regression: 224 of 238 motions collided, since scenes of a UR5 with stand and gripper were used for a UR5 alone."""
     file = ur5_files(tmp_path, "ur5_robotiq85", ["gripper_finger1_joint"])
-    with pytest.raises(rd.InputError) as raised:
-        rd.load_problem(file)
-    text = str(raised.value)
-    assert "robot_state.joint_state has values of gripper_finger1_joint, movable joints that ur5 lacks" in text
+    values = "robot_state.joint_state has values of gripper_finger1_joint, movable joints that ur5 lacks"
+    text = refuses(values, rd.load_problem, file)
     assert "robot_model_name is ur5_robotiq85" in text and "its movable joints are shoulder_pan_joint, " in text
-    refuses(r"scene0001.yaml: .* gripper_finger1_joint", read_moveit_scene, tmp_path / "scene0001.yaml", rd.load_robot("ur5"))
-    [entry] = load_motion_bench_maker(tmp_path, rd.load_robot("ur5"))
+    ur5 = rd.load_robot("ur5")
+    refuses(r"scene0001.yaml: .* gripper_finger1_joint", moveit.read_moveit_scene, tmp_path / "scene0001.yaml", ur5)
+    [entry] = load_motion_bench_maker(tmp_path, ur5)
     assert "gripper_finger1_joint" in entry.error
     scene = read_yaml(tmp_path / "scene0001.yaml")
     assert isinstance(scene, dict)
@@ -278,7 +269,7 @@ def test_joints_that_the_robot_lacks_can_be_ignored_and_another_model_name_is_a_
     assert "start_state.joint_state: ignored gripper_finger1_joint, which ur5 lacks" in notes
     [entry] = load_motion_bench_maker(tmp_path, rd.load_robot("ur5"), ignore_joints=True)
     assert entry.load().notes == notes
-    read_moveit_scene(tmp_path / "scene0001.yaml", rd.load_robot("ur5"), ignore_joints=True)
+    moveit.read_moveit_scene(tmp_path / "scene0001.yaml", rd.load_robot("ur5"), ignore_joints=True)
     notes = rd.load_problem(ur5_files(tmp_path, "ur5_lab", [])).notes
     assert notes == ("the scene's robot_model_name is ur5_lab; planned for ur5",)
     assert rd.load_problem(ur5_files(tmp_path, "ur5", [])).notes == ()
@@ -301,8 +292,7 @@ def test_a_mimic_joint_elsewhere_than_its_master_puts_it_is_a_note(tmp_path: Pat
     here = {"joint_state": {"name": ["turn", "grip", "follow"], "position": [0, 0.03, 0.01]}}
     goal = {"joint_constraints": [{"joint_name": "turn", "position": 0.1}]}
     (tmp_path / "scene0001.yaml").write_text("{}")
-    request = {"start_state": here, "goal_constraints": [goal]}
-    (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(request))
+    (tmp_path / "request0001.yaml").write_text(yaml.safe_dump({"start_state": here, "goal_constraints": [goal]}))
     [entry] = load_motion_bench_maker(tmp_path, robot)
     assert entry.load().notes == ("start_state: follow is 0.01, but it mimics grip: planned at 0.03",)
 
@@ -326,7 +316,7 @@ def asked(folder: Path, data: dict[str, Any]) -> ProblemEntry:
 def test_several_goal_constraints_are_a_set_and_one_without_a_joint_is_refused(tmp_path: Path) -> None:
     data = request_data()
     data["goal_constraints"].append(deepcopy(data["goal_constraints"][0]))
-    assert len(moveit_request(data, moveit_frames({}, PANDA)).joint_goals) == 2
+    assert len(moveit.moveit_request(data, moveit.moveit_frames({}, PANDA)).joint_goals) == 2
     del data["goal_constraints"][0]["joint_constraints"][3]
     assert "goal_constraints[0] has no panda_joint4" in asked(tmp_path, data).error
 
@@ -337,7 +327,7 @@ def test_pose_goal(tmp_path: Path) -> None:
     assert isinstance(goal, rd.PoseGoal) and goal.frame == "panda_hand"
     np.testing.assert_allclose(goal.T_base_frame[:3, 3], [0.4, 0, 0.5])
     np.testing.assert_allclose(goal.T_base_frame[:3, :3], np.diag([1.0, -1, -1]), atol=1e-12)
-    link, T = moveit_request(data, MoveItFrames({"": np.diag([-1.0, -1, 1, 1])})).pose_goal or ("", np.eye(4))
+    link, T = moveit.moveit_request(data, moveit.MoveItFrames({"": np.diag([-1.0, -1, 1, 1])})).pose_goal or ("", np.eye(4))
     assert link == "panda_hand"
     np.testing.assert_allclose(T[:3, 3], [-0.4, 0, 0.5])
     flipped = np.diag([-1.0, -1, 1]) @ rotation_from_quaternion(np.array([0.0, 1, 0, 0]))
@@ -390,12 +380,12 @@ def test_scaling_factors_padding_and_the_velocity_of_a_start_state_are_noted() -
     asked = {"max_velocity_scaling_factor": 0.1, "max_acceleration_scaling_factor": 1.0}
     data: dict[str, Any] = request_data() | asked
     data["start_state"]["joint_state"]["velocity"] = [0.0, 0.3]
-    assert {*moveit_request(data, moveit_frames({}, PANDA)).notes} == {
+    assert {*moveit.moveit_request(data, moveit.moveit_frames({}, PANDA)).notes} == {
         "the request's max_velocity_scaling_factor 0.1 is ignored: plan with velocity_scaling=0.1",
         "start_state.joint_state.velocity [0.0, 0.3] is ignored: the motion begins at rest",
     }
     padded = [{"link_name": "panda_hand", "padding": 0.02}, {"link_name": "b", "padding": 0.0}]
-    notes = scene_robot_notes({"link_padding": padded}, PANDA)
+    notes = moveit.scene_robot_notes({"link_padding": padded}, PANDA)
     assert notes == ("the scene's link_padding of panda_hand is ignored",)
 
 
@@ -418,7 +408,7 @@ WRONG_REQUESTS: dict[str, tuple[object, str]] = {
 
 @pytest.mark.parametrize(("data", "message"), WRONG_REQUESTS.values(), ids=WRONG_REQUESTS)
 def test_wrong_requests(data: object, message: str) -> None:
-    refuses(message, moveit_request, data, moveit_frames({}, PANDA))
+    refuses(message, moveit.moveit_request, data, moveit.moveit_frames({}, PANDA))
 
 
 Z = np.array([0.0, 0.0, 1.0])
@@ -446,7 +436,7 @@ def wheeled(folder: Path, above: tuple[str, ...]) -> rd.Robot:
 
 
 def place(data: dict[str, Any], robot: rd.Robot = PANDA) -> list[float]:
-    [shape] = moveit_scene(data, moveit_frames(data, robot), Path()).shapes
+    [shape] = shapes_of(data, robot)
     assert isinstance(shape, rd.Sphere)
     return shape.center.round(9).tolist()
 
@@ -463,8 +453,7 @@ def state(frame: str, *translations: list[float]) -> dict[str, Any]:
 
 
 def mounted(folder: Path, kind: str, *more: str) -> rd.Robot:
-    """An arm on a stand in the world, whose base is not the root of the URDF, as `robot add --base base` stores it, but without
-    spheres, whose fitting takes long."""
+    """An arm on a stand, stored as by `robot add --base base`, but without spheres, whose fitting takes long."""
     rail = joint("rail", "stand", "base", kind, xyz="0 0 0.3", axis="1 0 0")
     file = written(folder, link("world", ""), link("stand", ""), MOUNT, rail, TURN, *more)
     write_robot_folder(read_urdf(file, base="base", tip="arm"), folder / "mounted", {})
@@ -524,9 +513,8 @@ def test_scene_in_a_frame_that_the_robot_is_placed_in(tmp_path: Path) -> None:
 
 
 def test_links_of_the_robot_are_frames_where_they_stand(tmp_path: Path) -> None:
-    """A link named world is a frame even if it is not the root, and a file cannot give a link of the robot
-    another pose. Regression: `robot add --base` dropped the transform between root and base, and verified
-    motions were in collision by 8 cm."""
+    """Also one named world that is not the root; files cannot move links. Regression: `robot add --base` dropped the transform
+    between root and base, and verified motions were in collision by 8 cm."""
     eye = joint("eye", "base", "camera", "fixed", xyz="0 0 1")
     on = joint("on", "map", "world", "fixed", xyz="0 0 7")
     robot = mounted(tmp_path, "fixed", link("map", ""), link("camera", ""), on, eye)
