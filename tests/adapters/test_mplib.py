@@ -120,25 +120,22 @@ def test_failures_say_why(made: Planner) -> None:
 
 
 def test_bad_input() -> None:
-    for call, message in (
-        (lambda made: made.plan_pose([0.5, 0, 0.4], QPOS), r"pose is \[0.5, 0, 0.4\]; it must be x, y, z and a quat"),
-        (lambda made: made.plan_pose("here", QPOS), "pose is 'here'; it must be x, y, z and a quaternion"),
-        (lambda made: made.update_attached_box([0.1] * 3, np.zeros((4, 4))), "pose is .*; it must be a homogeneous"),
-        (lambda made: made.plan_pose([0.5, 0, 0.4, *DOWN], QPOS[:8]), "qpos is .*; it must be 9 numbers"),
-        (lambda made: made.plan_pose([0.5, 0, 0.4, *DOWN], "ready"), "qpos is 'ready'; it must be 9 numbers"),
-        (lambda made: made.plan_pose([0.5, 0, 0.4, *DOWN], QPOS, time_step=0), "time_step is 0; it must be"),
-        (lambda made: made.plan_qpos([QPOS, QPOS[:3]], QPOS), "goal_qposes is .*; it must be rows of 9 numbers"),
-        (lambda made: made.IK([0.5, 0, 0.4, *DOWN], QPOS, n_init_qpos=0), "count is 0; it must be an integer"),
-        (lambda made: made.update_point_cloud([[1, 1, 1]], -1.0), "resolution is -1.0; it must be a number"),
-        (lambda made: planner(joint_vel_limits=[1.0]), r"velocity limits are \[1.0\]; they must be 7 positive numbers"),
-        (lambda made: planner(joint_acc_limits=[-1.0] * 7), "acceleration limits are .*; they must be 7 positive"),
-        (lambda made: planner(user_joint_names="panda_joint1"), "user_joint_names is 'panda_joint1'; it must be a list"),
-        (lambda made: Planner("missing.urdf", HAND), "urdf missing.urdf does not exist"),
-        (lambda made: Planner(__file__, HAND, "missing"), "package_keyword_replacement is 'missing'; it must be a folder"),
-        (lambda made: planner(user_joint_names=JOINTS[1:]), "user_joint_names lacks panda_joint1"),
-        (lambda made: rd.Workspace(made.robot, "nose"), "unknown link 'nose'"),
-    ):
-        refuses(message, call, planner())
+    refuses(r"pose is \[0.5, 0, 0.4\]; it must be x, y, z and a quat", planner().plan_pose, [0.5, 0, 0.4], QPOS)
+    refuses("pose is 'here'; it must be x, y, z and a quaternion", planner().plan_pose, "here", QPOS)
+    refuses("pose is .*; it must be a homogeneous", planner().update_attached_box, [0.1] * 3, np.zeros((4, 4)))
+    refuses("qpos is .*; it must be 9 numbers", planner().plan_pose, [0.5, 0, 0.4, *DOWN], QPOS[:8])
+    refuses("qpos is 'ready'; it must be 9 numbers", planner().plan_pose, [0.5, 0, 0.4, *DOWN], "ready")
+    refuses("time_step is 0; it must be", planner().plan_pose, [0.5, 0, 0.4, *DOWN], QPOS, time_step=0)
+    refuses("goal_qposes is .*; it must be rows of 9 numbers", planner().plan_qpos, [QPOS, QPOS[:3]], QPOS)
+    refuses("count is 0; it must be an integer", planner().IK, [0.5, 0, 0.4, *DOWN], QPOS, n_init_qpos=0)
+    refuses("resolution is -1.0; it must be a number", planner().update_point_cloud, [[1, 1, 1]], -1.0)
+    refuses(r"velocity limits are \[1.0\]; they must be 7 positive numbers", planner, joint_vel_limits=[1.0])
+    refuses("acceleration limits are .*; they must be 7 positive", planner, joint_acc_limits=[-1.0] * 7)
+    refuses("user_joint_names is 'panda_joint1'; it must be a list", planner, user_joint_names="panda_joint1")
+    refuses("urdf missing.urdf does not exist", Planner, "missing.urdf", HAND)
+    refuses("package_keyword_replacement is 'missing'; it must be a folder", Planner, __file__, HAND, "missing")
+    refuses("user_joint_names lacks panda_joint1", planner, user_joint_names=JOINTS[1:])
+    refuses("unknown link 'nose'", rd.Workspace, planner().robot, "nose")
 
 
 def test_xacro_is_not_compiled(tmp_path: Path) -> None:
