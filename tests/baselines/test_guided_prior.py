@@ -1,6 +1,7 @@
 """The diffusion prior of MPD and EDMP, their guides, and planners around a denoiser of closed form."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -125,29 +126,21 @@ def test_samples_hold_their_ends_exactly() -> None:
     network = MotionNetwork(RANGES, SMALL)
     rng = np.random.default_rng(0)
     starts, goals = (rng.uniform(PANDA.lower, PANDA.upper, (3, PANDA.dof)).astype(np.float32) for _ in "ab")
-
-    def guide(q: ndarray, left: int) -> ndarray:
-        return q + np.float32(0.1 * (left < 2))
-
-    q = guided_prior.sample(network, starts, goals, np.array([255, 100, 20, 1]), rng, guide)
+    levels = np.array([255, 100, 20, 1])
+    q = guided_prior.sample(network, starts, goals, levels, rng, lambda q, left: q + np.float32(0.1 * (left < 2)))
     assert q.dtype == np.float32 and q.shape == (3, WAYPOINTS, PANDA.dof)
     assert np.array_equal(q[:, 0], starts) and np.array_equal(q[:, -1], goals)
     assert np.all(q >= PANDA.lower - 1e-5) and np.all(q <= PANDA.upper + 1e-5)
 
 
 def test_the_guide_gets_the_number_of_steps_to_come(gaussian: Gaussian) -> None:
-    told: list[int] = []
-
-    def guide(q: ndarray, left: int) -> ndarray:
-        told.append(left)
-        return q
-
+    guide = Mock(side_effect=lambda q, left: q)
     ends = LEFT[None], RIGHT[None]
     guided_prior.sample(gaussian, *ends, np.array([255, 90, 1]), np.random.default_rng(0), guide, quiet_steps=2)
-    assert told == [2, 1, 0, 0, 0]
+    assert [call.args[1] for call in guide.call_args_list] == [2, 1, 0, 0, 0]
     with deadline(lambda: 0.0), pytest.raises(OutOfTimeError):
         guided_prior.sample(gaussian, *ends, np.array([255, 1]), np.random.default_rng(0), guide)
-    assert len(told) == 5
+    assert guide.call_count == 5
 
 
 @pytest.mark.parametrize("spaced", [guided_prior.exponential_levels, guided_prior.quadratic_levels])

@@ -4,6 +4,7 @@ import gc
 import runpy
 import sys
 from itertools import product
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -110,11 +111,8 @@ def test_a_refused_path_is_searched_again_more_closely(planner, monkeypatch):
 
 @every
 def test_an_error_below_ompl_comes_out(planner, monkeypatch):
-    def broken(*_):
-        raise RuntimeError("broken kernel")
-
     with monkeypatch.context() as patched:
-        patched.setattr(ompl, "motions_free", broken)
+        patched.setattr(ompl, "motions_free", Mock(side_effect=RuntimeError("broken kernel")))
         # start and goal are checked by the kernel too
         patched.setattr("robotdiffuse.planning.planner.usable_start_goal", UncheckedStartGoal)
         with pytest.raises(RuntimeError, match="broken kernel"):

@@ -23,8 +23,6 @@ from robotdiffuse.collision.point_cloud_grid import THINNING
 from robotdiffuse.problems.families.family import base_spheres
 from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
 
-# -- distances -----------------------------------------------------------------------------------------------
-
 
 @pytest.mark.parametrize("name", oracles.ROBOTS)
 def test_clearances_are_exact(name: str) -> None:
@@ -117,9 +115,6 @@ def test_any_number_of_configurations(count: int) -> None:
     assert checker.cost_gradients(q[:count], 0.05)[1].shape == (count, PANDA.dof)
 
 
-# -- against the exact meshes --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_free_by_spheres_is_free_by_mesh(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -161,9 +156,6 @@ def test_long_poles_keep_their_precision() -> None:
         np.testing.assert_allclose(long.link_clearances(q), short.link_clearances(q), atol=oracles.TOLERANCE)
 
 
-# -- robots --------------------------------------------------------------------------------------------------
-
-
 def test_a_robot_without_spheres_is_free() -> None:
     robot = replace(box_arm(), spheres={})
     checker = CollisionChecker(robot, rd.Scene([rd.Sphere((0, 0, 0), 5.0), rd.PointCloud([[0.0, 0, 0]])]))
@@ -201,9 +193,6 @@ def test_adding_an_obstacle_compiles_nothing() -> None:
         checker.cost_gradients(q, 0.05)
         compiled.append([len(f.signatures) for f in (free_many, block_hits, block_clearances, motion_free)])
     assert compiled[0] == compiled[1] == compiled[2]
-
-
-# -- gradients -----------------------------------------------------------------------------------------------
 
 
 def cost(robot: rd.Robot, scene: rd.Scene, q: ndarray, margin: float, self_margin: float) -> ndarray:

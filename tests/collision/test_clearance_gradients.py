@@ -19,7 +19,6 @@ from robotdiffuse.scenes.scene_arrays import PackedScenes
 PANDA = rd.load_robot("panda")
 LIMIT = 0.4
 MARGIN = 0.1
-SHAPES = solids()
 
 
 def configurations(*shape: int, seed: int = 0) -> np.ndarray:
@@ -48,7 +47,7 @@ def test_inputs_are_the_same_in_training_and_planning() -> None:
 def test_gradients_are_those_of_the_clearances() -> None:
     """Compares with automatic differentiation of the signed distance that training losses use."""
     q = configurations(400).astype(np.float64)
-    scene = rd.Scene(SHAPES.shapes[:2])
+    scene = rd.Scene(solids().shapes[:2])
     checker = CollisionChecker(PANDA, scene)
     packed = PackedScenes.pack([scene] * len(q), 2)
     distance = ArmDistance(ForwardKinematics(PANDA, torch.float64))

@@ -172,13 +172,9 @@ def test_compared_are_problems_that_all_planners_were_given_this_time_for(tmp_pa
 
 
 def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> None:
-    records = []
-    for seed in range(3):
-        records.append(solved("robotdiffuse", "a", 1.0, [(0.1, 2.0)], seed=seed))
-        records.append(solved("mpd", "a", 1.0, [(0.1, 2.0 + seed)], seed=seed))
-        records.append(solved("robotdiffuse", "b", 1.0, [(0.1, 2.0)], seed=seed))
-        one = solved("mpd", "b", 1.0, [(0.1, 2.0)], seed=seed)
-        records.append(one if seed == 0 else failed("mpd", "b", 1.0, 1.0, seed=seed))
+    records = [solved("robotdiffuse", name, 1.0, [(0.1, 2.0)], seed=seed) for name in "ab" for seed in range(3)]
+    records += [solved("mpd", "a", 1.0, [(0.1, 2.0 + seed)], seed=seed) for seed in range(3)]
+    records += [solved("mpd", "b", 1.0, [(0.1, 2.0)]), *(failed("mpd", "b", 1.0, 1.0, seed=seed) for seed in (1, 2))]
     (section,) = bench_comparisons.sections(bench_comparisons.read_bench(write(tmp_path / "run", records)), [1.0])
     row = rows(section, 1.0)["mpd"]
     assert section.main.seeds == 3 and row.figures.success == pytest.approx(400 / 6)
@@ -187,19 +183,12 @@ def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> Non
 
 
 def test_intervals_are_over_problems_not_over_their_seeds(tmp_path: Path) -> None:
-    (section,) = bench_comparisons.sections(
-        bench_comparisons.read_bench(
-            write(
-                tmp_path / "run",
-                [
-                    solved("mpd", name, 1.0, [(0.1, 2.0)], seed=seed, measures=MEASURES | {"duration": duration})
-                    for name, duration in {"a": 1.0, "b": 2.0, "c": 4.0}.items()
-                    for seed in range(8)
-                ],
-            )
-        ),
-        [1.0],
-    )
+    records = [
+        solved("mpd", name, 1.0, [(0.1, 2.0)], seed=seed, measures=MEASURES | {"duration": duration})
+        for name, duration in {"a": 1.0, "b": 2.0, "c": 4.0}.items()
+        for seed in range(8)
+    ]
+    (section,) = bench_comparisons.sections(bench_comparisons.read_bench(write(tmp_path / "run", records)), [1.0])
     row = rows(section, 1.0)["mpd"]
     half = 1.96 * np.std([1, 2, 4], ddof=1) / np.sqrt(3)
     assert str(row.mean(METRICS["duration"])) == f"{7 / 3:.2f} ± {half:.2f}"

@@ -33,6 +33,11 @@ def small_model(seed: int = 0) -> MotionNetwork:
     return model
 
 
+def nothing_near(q: np.ndarray) -> np.ndarray:
+    """Clearances of the arm's three moving links."""
+    return np.full((*q.shape[:-1], 3), 0.4, np.float32)
+
+
 def cloud(n: int, seed: int = 0) -> torch.Tensor:
     points = np.random.default_rng(seed).uniform([-0.5, -0.5, 0.1], [0.5, 0.5, 0.8], (1, n, 3))
     return torch.from_numpy(points.astype(np.float32))

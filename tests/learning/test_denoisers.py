@@ -10,7 +10,7 @@ import torch
 
 from helpers.box_arm import box_arm
 from helpers.refusals import refuses
-from helpers.small_model import SMALL_ENCODER, small_model
+from helpers.small_model import SMALL_ENCODER, nothing_near, small_model
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning import denoisers
 from robotdiffuse.learning.checkpoint import load_network, save_network
@@ -147,13 +147,10 @@ def model_with(name: str, null_condition: bool = False) -> MotionNetwork:
 
 
 def sample(model: MotionModel, scale: float = 1.0) -> np.ndarray:
-    def clearances(q: np.ndarray) -> np.ndarray:
-        return np.full((*q.shape[:-1], len(model.robot.links)), 0.1, np.float32)
-
     ends = np.array([-1.0, 0.5, 2.0]), np.array([1.5, -0.5, 0.1])
     code = np.ones(model.settings.code, np.float32)
     settings = SamplingSettings(samples=3, sampling_steps=3, guidance_scale=scale)
-    return model.sample(*ends, code, clearances, np.random.default_rng(0), settings)
+    return model.sample(*ends, code, nothing_near, np.random.default_rng(0), settings)
 
 
 @pytest.mark.slow

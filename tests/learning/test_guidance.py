@@ -21,7 +21,6 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
 
 WAYPOINTS = 24
-BALL = (1.02, 0.55, 0.0)
 
 
 def straight(start: ndarray, goal: ndarray, waypoints: int = WAYPOINTS) -> ndarray:
@@ -29,7 +28,7 @@ def straight(start: ndarray, goal: ndarray, waypoints: int = WAYPOINTS) -> ndarr
 
 
 def swing() -> tuple[CollisionChecker, ndarray]:
-    checker = CollisionChecker(box_arm(), Scene([Sphere(BALL, 0.08)]))
+    checker = CollisionChecker(box_arm(), Scene([Sphere((1.02, 0.55, 0.0), 0.08)]))
     through = straight(np.array([-0.8, 0.6, 0.6]), np.array([0.8, 0.6, 0.6]))
     clear = straight(np.array([1.2, 0.2, 0.1]), np.array([2.0, 0.1, 0.4]))
     return checker, np.stack([through, clear])
@@ -145,9 +144,8 @@ HAND = "panda_hand"
 TILTED = np.array([-0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2])
 REACHED = np.array([0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2])
 AT = PANDA.fk(TILTED, HAND)[:3, 3]
-CONE = rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.2)
 EACH: list[Constraint] = [
-    CONE,
+    rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.2),
     rd.PositionBox(HAND, [0.2, -0.6, AT[2] - 0.02], [0.8, 0.6, AT[2] + 0.02]),
     rd.OnPlane(HAND, AT, [0, 0, 1], 0.002),
     rd.OnLine(HAND, AT, [0, 1, 0], 0.002),

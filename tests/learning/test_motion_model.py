@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import torch
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.refusals import refuses
-from helpers.small_model import cloud, small_model
+from helpers.small_model import cloud, nothing_near, small_model
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.learning.denoisers import TransformerSettings
@@ -29,11 +30,8 @@ GOAL = np.array([1.5, -0.5, 0.1])
 
 
 def sample_with(model: MotionNetwork, settings: SamplingSettings, guide: GuideFn | None = None) -> np.ndarray:
-    def far(q: np.ndarray) -> np.ndarray:
-        return np.full((*q.shape[:2], 3), 0.4, np.float32)
-
     code = np.zeros(8, np.float32)
-    return model.sample(START, GOAL, code, far, np.random.default_rng(0), settings, guide)
+    return model.sample(START, GOAL, code, nothing_near, np.random.default_rng(0), settings, guide)
 
 
 def test_nearest_and_chamfer_against_all_pairs():
@@ -96,15 +94,10 @@ def test_residual_and_joints_are_inverse():
 @pytest.mark.parametrize(("steps", "share", "guided"), [(5, 0.5, 3), (1, 0.5, 1), (6, 0.0, 0), (50, 0.02, 1)])
 def test_the_last_share_of_the_steps_is_guided(steps: int, share: float, guided: int) -> None:
     model = small_model()
-    levels = []
-
-    def guide(q: np.ndarray, level: float) -> np.ndarray:
-        levels.append(level)
-        return q
-
+    guide = Mock(side_effect=lambda q, level: q)
     sample_with(model, SamplingSettings(samples=1, sampling_steps=steps, guided_share=share), guide)
     expected = model.schedule.sampling_levels(steps)[:-1] / model.schedule.steps
-    np.testing.assert_allclose(levels, expected[steps - guided :])
+    np.testing.assert_allclose([call.args[1] for call in guide.call_args_list], expected[steps - guided :])
 
 
 def test_a_sampler_by_name_is_that_of_a_checkpoint() -> None:

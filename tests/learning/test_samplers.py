@@ -1,6 +1,7 @@
 """Schedule, objectives, samplers: on Gaussian data, where closed forms are known, and against diffusers."""
 
 from collections.abc import Callable
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -88,14 +89,9 @@ def draws_for(steps: int) -> list[np.ndarray]:
 
 
 def our_steps(name: str, schedule: NoiseSchedule, steps: int, eta: float) -> np.ndarray:
-    found = []
-    draws = iter(draws_for(steps))
-
-    def predict(x, level):
-        found.append(x)
-        return network(x, level)
-
-    return np.array([*found, SAMPLERS.load(name)(predict, schedule, draws.__next__, steps, eta)])
+    predict = Mock(wraps=network)
+    sample = SAMPLERS.load(name)(predict, schedule, iter(draws_for(steps)).__next__, steps, eta)
+    return np.array([*(call.args[0] for call in predict.call_args_list), sample])
 
 
 def their_steps(levels: list[int], scheduler, variance_noise: bool, **settings) -> np.ndarray:

@@ -71,10 +71,6 @@ def test_an_image_that_sees_through_the_arm_is_refused(factor: float, message: s
     assert arm.map.is_blind
 
 
-def test_a_negative_seed_is_refused() -> None:
-    refuses("seed is -1; it must be at least 0", rd.Explorer, PANDA, seed=-1)
-
-
 def test_a_view_of_another_thread_waits_for_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
     arm = explorer(goal=RIGHT)
     before = arm.map.unknown
@@ -311,6 +307,7 @@ def test_fields_that_exploring_would_ignore_are_refused(name: str) -> None:
         ({"robot": "panda"}, "robot is 'panda'; it must be a Robot"),
         ({"cameras": ["wrist"]}, r"cameras\[0\] is 'wrist'; it must be an ArmCamera"),
         ({"scene": []}, r"scene is \[\]; it must be a Scene"),
+        ({"seed": -1}, "seed is -1; it must be at least 0"),
     ],
 )
 def test_an_explorer_of_wrong_parts_is_refused(wrong: dict[str, object], message: str) -> None:

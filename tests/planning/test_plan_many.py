@@ -26,16 +26,12 @@ def problems() -> list[rd.Problem]:
 
 def test_results_are_in_order_and_as_alone() -> None:
     counts: list[tuple[int, int]] = []
-
-    def progress(done: int, total: int) -> None:
-        counts.append((done, total))
-
     cup = rd.Cylinder([0, 0, 0.16], 0.03, 0.12, name="cup")
     assert list(rd.plan_many([])) == []
     asked = problems()
     asked.insert(1, replace(asked[0], robot=PANDA.attach(cup, "panda_hand")))
     request: dict[str, Any] = {"settings": {"range": 0.3}, "until": "first", "time_limit": 300.0, "seed": 3}
-    results = list(rd.plan_many(asked, "aorrtc", workers=2, progress=progress, **request))
+    results = list(rd.plan_many(asked, "aorrtc", workers=2, progress=lambda *at: counts.append(at), **request))
     assert counts == [(done, 5) for done in range(1, 6)]
     assert [result.status for result in results] == [rd.Status.SOLVED] * 4 + [rd.Status.INVALID_START]
     for problem, together in zip(asked[:4], results[:4], strict=True):

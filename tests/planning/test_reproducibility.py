@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -70,19 +71,15 @@ def test_the_first_call_and_later_ones_give_the_same_path_although_paths_are_ref
         refusals.append(path.length)
         return Report(False, Violation("scene_collision", 0.0, "refused by the test"), None, None)
 
-    problem = rd.load_problem(SHELF)
-
-    def call() -> rd.PlanResult:
-        return rd.plan(problem, 60.0, seed=1, planner=planner)
-
+    call = partial(rd.plan, rd.load_problem(SHELF), 60.0, planner=planner)
     monkeypatch.setattr(Verifier, "path", refuses_some)
-    first = call()
+    first = call(seed=1)
     refused = len(refusals)
     assert refused > 0
     for seed in range(2, 4):
-        other = rd.plan(problem, 60.0, seed=seed, planner=planner, until="first").path
+        other = call(seed=seed, until="first").path
     refusals.clear()
-    later = call()
+    later = call(seed=1)
     assert len(refusals) == refused
     assert np.array_equal(first.path.positions, later.path.positions)
     assert not np.array_equal(first.path.positions, other.positions)

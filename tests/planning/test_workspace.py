@@ -166,8 +166,7 @@ def test_values_by_joint_are_a_configuration() -> None:
 
 
 FINGERS = ["panda_hand", "panda_leftfinger", "panda_rightfinger"]
-DOWN = [np.pi, 0.0, 0.0]
-GRASP = rd.pose([0.5, -0.3, 0.18], rpy=DOWN)
+GRASP = rd.pose([0.5, -0.3, 0.18], rpy=[np.pi, 0.0, 0.0])
 
 
 def table_with_can() -> rd.Workspace:

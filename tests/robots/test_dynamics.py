@@ -21,7 +21,6 @@ pinocchio: Any = pytest.importorskip("pinocchio", reason="the extra `dynamics` (
 PANDA = rd.load_robot("panda")
 LOW = [-0.6, 0.2, 0, -1.2, 0, 2.2, 0.2]
 FAR = [0.6, 0.6, 0, -1.0, 0, 2.2, 0.2]
-Y = np.array([0.0, 1.0, 0.0])
 
 
 def test_a_pendulum_by_hand() -> None:
@@ -32,7 +31,7 @@ def test_a_pendulum_by_hand() -> None:
     moment = 2 / 12 + 2 * 0.25 + 1.5
     expected = (2 * 0.5 + 1.5) * GRAVITY * np.sin(0.7) + moment * 2.0
     assert dynamics.torques(q, v, a)[0, 0] == pytest.approx(expected, abs=1e-9)
-    lying = transform(np.zeros(3), rotation_about(Y, np.pi / 2))  # gravity along the base's x
+    lying = transform(np.zeros(3), rotation_about(np.array([0.0, 1.0, 0.0]), np.pi / 2))  # gravity along the base's x
     turned = Dynamics(pendulum(), rd.Payload(1.5, [0.0, 0.0, -1.0]), lying)
     assert abs(turned.holding_torques(np.zeros((1, 1)))[0, 0]) == pytest.approx(2.5 * GRAVITY, abs=1e-9)
 

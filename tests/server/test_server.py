@@ -173,6 +173,7 @@ def test_other_hosts_content_types_and_methods_are_refused(server: httpx.Client)
     form = server.post("/plan", content=json.dumps(asked()), headers={"Content-Type": "text/plain"})
     assert (rebound.status_code, form.status_code) == (421, 415)
     assert server.get("/plan").status_code == 405 and server.get("/../../etc/passwd").status_code == 404
+    assert error(server.get("/plan")) == "'/plan' does not take GET; it takes POST"
     for answer in (rebound, form, server.get("/plan"), server.get("/etc"), server.delete("/requests/x")):
         error(answer)
 
@@ -184,10 +185,6 @@ def test_a_client_that_closes_after_sending_gets_its_error(server: httpx.Client)
         with pytest.raises(urllib.error.HTTPError) as refused:
             urllib.request.urlopen(request)
         assert refused.value.code == code and b'{"error": "' in refused.value.read()
-
-
-def test_a_wrong_method_is_told_the_right_one(server: httpx.Client) -> None:
-    assert error(server.get("/plan")) == "'/plan' does not take GET; it takes POST"
 
 
 def test_lists_health_metrics_and_a_page_without_scripts(server: httpx.Client) -> None:

@@ -510,12 +510,8 @@ def test_eight_threads_validate_motions_of_one_problem() -> None:
     problem = rd.Problem(robot=PANDA, scene=rd.Scene(shapes), start=start, goal=start)
     ends = start + np.random.default_rng(0).uniform(-0.1, 0.1, (64, 1, PANDA.dof)) * (PANDA.upper - PANDA.lower)
     motions = [rd.Path(PANDA.joint_names, np.stack([start, end, start])) for end in ends[:, 0]]
-
-    def validated(motion: rd.Path) -> Report:
-        return rd.verify(problem, motion)
-
-    alone = [validated(motion) for motion in motions]
+    alone = [rd.verify(problem, motion) for motion in motions]
     with ThreadPoolExecutor(8) as threads:
-        together = list(threads.map(validated, motions))
+        together = list(threads.map(lambda motion: rd.verify(problem, motion), motions))
     assert [str(report) for report in together] == [str(report) for report in alone]
     assert {report.valid for report in alone} == {True, False}

@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 
 import robotdiffuse as rd
 from helpers.refusals import refuses
-from helpers.small_model import SMALL_ENCODER
+from helpers.small_model import SMALL_ENCODER, nothing_near
 from helpers.trainings import read_log
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.output_files import lock_folder
@@ -102,12 +102,8 @@ def test_losses_are_computed_where_the_model_is(denoiser, data, arm):
     encoder = make_encoder("points") if changes else load_encoder(data.parent / "encoder")
     model = MotionNetwork(RobotIdentity.of(arm), training.model_settings(settings, encoder))
     loaded = load_data(str(data), arm, encoder, WAYPOINTS, lambda text: None)
-
-    def far(scenes, q):
-        return np.full((*q.shape[:-1], len(model.robot.links)), 0.4, np.float32)
-
     rng = np.random.default_rng(0)
-    batch = Batches(loaded, model, far, 0.1, 5.0).draw(4, rng)
+    batch = Batches(loaded, model, lambda _, q: nothing_near(q), 0.1, 5.0).draw(4, rng)
     elsewhere = Processes("cpu")
     elsewhere.device = torch.device("meta")
     model = model.to("meta")
@@ -177,12 +173,8 @@ def test_every_choice_trains_and_plans(changes, tmp_path, data, arm, monkeypatch
     start = np.array([-1.0, 0.2, 0.5])
     goal = np.array([1.0, -0.3, 0.4])
     z = model.encode(np.zeros((0, 3)))
-
-    def clearances(q):
-        return np.full((*q.shape[:2], 3), 0.3, np.float32)
-
     settings = SamplingSettings(samples=3, sampling_steps=8)
-    q = model.sample(start, goal, z, clearances, np.random.default_rng(0), settings)
+    q = model.sample(start, goal, z, nothing_near, np.random.default_rng(0), settings)
     assert q.shape == (3, WAYPOINTS, 3) and np.isfinite(q).all()
     assert (q[:, 0] == start).all() and (q[:, -1] == goal).all()
     assert (q >= arm.lower).all() and (q <= arm.upper).all()

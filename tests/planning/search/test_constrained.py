@@ -19,11 +19,10 @@ AT = PANDA.fk(START, HAND)[:3, 3]
 WALL = rd.Box([0.5, 0.0, 0.2], [0.3, 0.06, 0.4], name="wall")
 UPRIGHT = rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], np.radians(10))
 LINE = rd.CartesianLine(HAND, 1e-3, 0.02, 0.25)
-PLANE = rd.OnPlane(HAND, AT, [0, 0, 1], 2e-3)
 CASES: list[tuple[list[Constraint], rd.Scene]] = [
     ([UPRIGHT], rd.Scene([WALL])),
     ([LINE], rd.Scene()),
-    ([PLANE], rd.Scene([rd.Box([0.6, 0.0, 0.25], [0.05, 0.06, 0.3], name="post")])),
+    ([rd.OnPlane(HAND, AT, [0, 0, 1], 2e-3)], rd.Scene([rd.Box([0.6, 0.0, 0.25], [0.05, 0.06, 0.3], name="post")])),
     ([rd.OnLine(HAND, AT, [0, 1, 0], 2e-3)], rd.Scene()),
     ([rd.PositionBox(HAND, [0.2, -0.6, 0.1], [0.8, 0.6, 0.7]), UPRIGHT], rd.Scene([WALL])),
 ]

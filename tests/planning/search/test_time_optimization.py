@@ -11,8 +11,7 @@ from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.trajectories.speed_limits import TimingSettings
 from robotdiffuse.trajectories.straight_line import straight_line_time
 
-WALL = rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8])
-AROUND = rd.Problem(PANDA, rd.Scene([WALL]), LEFT, RIGHT)
+AROUND = rd.Problem(PANDA, rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8])]), LEFT, RIGHT)
 DETOUR = LEFT + np.array([[0, 0, 0, 0, 0, 0, 0], [0.6, 0.4, 0, 0, 0, 0, 0], [-1.5, 1.2, 0, 0, 0, 0, 0]])
 """Joint 1 is limited by its velocity, joint 2 by its acceleration."""
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 import robotdiffuse as rd
 from helpers.commands import written
+from helpers.panda import PANDA
 from helpers.refusals import refuses
 from robotdiffuse.core.transforms import rotation_about, rotation_from_rpy, transform
 from robotdiffuse.problems.files import load_problems, problem_from_record, problem_record, save_problem
@@ -69,9 +70,6 @@ def test_values_of_continuous_joints_are_kept(angle: float) -> None:
     assert made.start[1] == angle and made.notes == ()
 
 
-MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
-
-
 def test_wrong_problems() -> None:
     refuses("start has 2 values; crane has 3 planned joints: swing, spin, lift", problem, [0, 0])
     refuses(r"goal\[0\] has 2 values", problem, goal=[[0, 0], [1, 1]])
@@ -81,7 +79,7 @@ def test_wrong_problems() -> None:
     refuses("start is None", problem, None)
     refuses("unknown link in goal.frame: 'claw'", problem, goal=rd.PoseGoal("claw", np.eye(4)))
     refuses("no planned joint moves 'plinth'", problem, goal=rd.PoseGoal("plinth", np.eye(4)))
-    refuses("it must be a homogeneous transform", rd.PoseGoal, "hook", MIRROR)
+    refuses("it must be a homogeneous transform", rd.PoseGoal, "hook", np.diag([1.0, 1.0, -1.0, 1.0]))
     refuses("scene is .*; it must be a Scene", rd.Problem, crane(), [], [0], [0])
 
 
@@ -254,17 +252,15 @@ def test_records_of_others_name_no_files_that_are_read() -> None:
         {"views": [{"cloud": "a.ply", "camera": CAMERA}]},
     ):
         record = {"robot": "panda", "scene": [], "start": READY, "goal": {"joints": READY}} | changed
-        robots = {"panda": rd.load_robot("panda")}
-        refuses("is a file, and files are not read here", problem_from_record, record, robots)
-        refuses(
-            "files are not read here", problem_from_record, {"robot": "panda", "scene": [], "request": "/etc/passwd"}, robots
-        )
+        refuses("is a file, and files are not read here", problem_from_record, record, {"panda": PANDA})
+    record = {"robot": "panda", "scene": [], "request": "/etc/passwd"}
+    refuses("files are not read here", problem_from_record, record, {"panda": PANDA})
 
 
 @pytest.mark.parametrize("robot", ["ur5", "panda/robot.json", "../panda", "/etc/passwd", "a.urdf", 1, None])
 def test_records_of_others_have_the_robots_that_are_given(robot: object) -> None:
     record = {"robot": robot, "scene": [], "start": READY, "goal": {"joints": READY}}
-    refuses(r"unknown robot .*; known: panda", problem_from_record, record, {"panda": rd.load_robot("panda")})
+    refuses(r"unknown robot .*; known: panda", problem_from_record, record, {"panda": PANDA})
 
 
 NAMED = [0.0, -np.pi / 4, 0.0, -0.75 * np.pi, 0.0, np.pi / 2, np.pi / 4]

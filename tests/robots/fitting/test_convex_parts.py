@@ -17,9 +17,8 @@ FRAME = boxes(
     ((0, 0, 0.05), (0.05, 0.1, 0.35)),
     ((0.35, 0, 0.05), (0.4, 0.1, 0.35)),
 )
-TUBE = trimesh.creation.annulus(0.08, 0.1, 0.3, sections=48)
 BOWL = trimesh.creation.icosphere(3, 0.1).slice_plane([0, 0, 0], [0, 0, -1])  # open
-MESHES = {"L": L, "frame": FRAME, "tube": TUBE, "bowl": BOWL}
+MESHES = {"L": L, "frame": FRAME, "tube": trimesh.creation.annulus(0.08, 0.1, 0.3, sections=48), "bowl": BOWL}
 SLOW_MESHES = ("bowl", "tube")
 
 

@@ -105,19 +105,11 @@ def test_published_arms_end_where_their_grippers_begin(tmp_path: Path) -> None:
     refuses(r"right .7 joints to right_gripper_base_link", read_urdf, data / "baxter_description/urdf/baxter.urdf")
 
 
-MIMIC = '<mimic joint="grip" multiplier="-0.5" offset="0.1"/>'
-
-
 def test_mimic_joints_follow(tmp_path: Path) -> None:
     """Including a mimic of a mimic joint, and a robot written to and read from a folder."""
-    parts = (
-        chain("j6_link", ["grip"])
-        + link("b")
-        + joint("other", "j6_link", "b", more=MIMIC)
-        + link("c")
-        + joint("third", "b", "c", more='<mimic joint="other" multiplier="2"/>')
-    )
-    robot = read_urdf(written(tmp_path, ARM, parts))
+    other = joint("other", "j6_link", "b", more='<mimic joint="grip" multiplier="-0.5" offset="0.1"/>')
+    third = joint("third", "b", "c", more='<mimic joint="other" multiplier="2"/>')
+    robot = read_urdf(written(tmp_path, ARM, chain("j6_link", ["grip"]), link("b"), other, link("c"), third))
     assert robot.locked == {"grip": 0.0, "other": 0.1, "third": 0.2}
     write_robot_folder(robot, tmp_path / "kept", {})
     for arm in (robot, read_robot_folder(tmp_path / "kept")):
@@ -141,13 +133,10 @@ def test_mimics_of_planned_joints_raise_unless_they_are_locked(tmp_path: Path) -
 
 @pytest.mark.parametrize("followed", ["nobody", "rod", "other"])
 def test_mimic_of_nothing_or_in_a_circle(followed: str, tmp_path: Path) -> None:
-    parts = (
-        link("bar")
-        + joint("rod", "base", "bar", more=f'<mimic joint="{followed}"/>')
-        + link("end")
-        + joint("other", "base", "end", more='<mimic joint="rod"/>')
-    )
-    refuses("another joint of the file and must not mimic", read_urdf, written(tmp_path, ARM, parts))
+    rod = joint("rod", "base", "bar", more=f'<mimic joint="{followed}"/>')
+    other = joint("other", "base", "end", more='<mimic joint="rod"/>')
+    file = written(tmp_path, ARM, link("bar"), rod, link("end"), other)
+    refuses("another joint of the file and must not mimic", read_urdf, file)
 
 
 SRDF = """<robot name="made">

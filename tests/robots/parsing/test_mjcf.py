@@ -165,18 +165,9 @@ def test_obstacles_without_names_have_numbers() -> None:
     assert [shape.name for shape in rd.Scene.from_mujoco(model).shapes] == ["geom0"]
 
 
-HILLY = """
-<mujoco>
-  FIELD
-  <worldbody>
-    <body name="b">
-      <joint name="j" range="-1 1"/>
-      <geom name="hill" type="hfield" hfield="h" {}/>
-      <geom size="1"/>
-    </body>
-  </worldbody>
-</mujoco>
-""".replace("FIELD", FIELD)
+HILLY = f"""<mujoco>{FIELD}<worldbody><body name="b">
+  <joint name="j" range="-1 1"/><geom name="hill" type="hfield" hfield="h" {{}}/><geom size="1"/>
+</body></worldbody></mujoco>"""
 
 
 def test_a_height_field_that_collides_with_nothing_is_left_out(tmp_path: Path) -> None:
@@ -226,11 +217,9 @@ PLACED = """
   <compiler angle="radian"/>
   <worldbody>
     <body name="base" pos="0.1 0 0.2">
-      <joint name="x" type="slide" axis="1 0 0" pos="0 0 1" ref="0.3"/>
-      <geom size="0.1"/>
+      <joint name="x" type="slide" axis="1 0 0" pos="0 0 1" ref="0.3"/><geom size="0.1"/>
       <body name="arm" pos="0 0 0.3">
-        <joint name="j" axis="0 1 0" range="-1 1"/>
-        <geom type="capsule" size="0.03 0.1" pos="0 0 0.2"/>
+        <joint name="j" axis="0 1 0" range="-1 1"/><geom type="capsule" size="0.03 0.1" pos="0 0 0.2"/>
       </body>
     </body>
   </worldbody>
@@ -285,14 +274,9 @@ def test_mirrored_meshes_are_where_mujoco_has_them_and_what_is_not_driven_is_non
     np.testing.assert_allclose(wedge.vertices.max(axis=0), [0.07, 0.025, 0.1], atol=1e-6)
 
 
-HOLLOW = """
-<mujoco>
-  <asset><mesh name="u" vertex="{}" face="{}"/></asset>
-  <worldbody>
-    <body name="base"><joint name="j" range="-1 1"/><geom type="mesh" mesh="u"/></body>
-  </worldbody>
-</mujoco>
-"""
+HOLLOW = """<mujoco><asset><mesh name="u" vertex="{}" face="{}"/></asset><worldbody>
+  <body name="base"><joint name="j" range="-1 1"/><geom type="mesh" mesh="u"/></body>
+</worldbody></mujoco>"""
 
 
 def test_meshes_that_collide_are_hulls_as_for_mujoco(tmp_path: Path) -> None:

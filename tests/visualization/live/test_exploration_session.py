@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -80,12 +81,8 @@ def test_a_pause_holds_the_arm_and_a_restart_begins_anew(session: live.Explorati
 
 
 def test_an_error_is_shown_and_a_restart_helps(session: live.ExplorationSession, monkeypatch: pytest.MonkeyPatch) -> None:
-
-    def fails(*_: object) -> None:
-        raise ValueError("no camera")
-
     with monkeypatch.context() as patch:
-        patch.setattr(live, "simulated_explorer", fails)
+        patch.setattr(live, "simulated_explorer", Mock(side_effect=ValueError("no camera")))
         session.set_mode(live.RUNNING)
         state = until(session, lambda state: state.phase == live.ENDED)
         assert live.exploration_badge(state).lines == ("ValueError: no camera",)
