@@ -45,7 +45,7 @@ NAMED = {
 
 
 def one_line(call: Callable[[], object]) -> str:
-    message = refuses("", call)
+    message = refuses(".", call)
     assert message.isprintable()
     assert len(message) < 500
     return message

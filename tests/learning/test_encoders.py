@@ -223,7 +223,7 @@ def test_training_from_the_command_line(tmp_path, capsys, monkeypatch):
     assert "reconstruction: " in capsys.readouterr().out
     assert load_encoder(out).settings == encoders.CompressionAutoencoderSettings()
     assert main([*command, "pointnett"]) == 2
-    assert "known: compression_autoencoder, dgcnn" in capsys.readouterr().err
+    assert "known: compression_autoencoder, point_autoencoder" in capsys.readouterr().err
 
 
 @pytest.fixture

@@ -85,7 +85,7 @@ def test_large_input_stays_small(arm, tmp_path):
 @pytest.mark.parametrize(("write", "ending"), [(write_picture, "png"), (write_replay, "html")])
 def test_bad_output_is_one_line(arm, motion, write, ending, name, tmp_path):
     (tmp_path / f"folder.{ending}").mkdir()
-    refuses("", write, arm, Scene(), motion, tmp_path / name.format(ending, ending))
+    refuses(".", write, arm, Scene(), motion, tmp_path / name.format(ending, ending))
     assert [entry.name for entry in tmp_path.iterdir()] == [f"folder.{ending}"], "nothing is left behind"
 
 
