@@ -103,24 +103,23 @@ def test_what_cannot_be_held_is_told() -> None:
 
 
 GOOD: dict[str, Any] = {"robot": "panda", "scene": [], "start": LOW, "goal": {"joints": FAR}}
-WRONG = {
-    "mass": ({"mass": -1}, "payload.mass is -1; it must be a number of kg from 0 to 10000"),
-    "no mass": ({"com": [0, 0, 0]}, "missing field of payload: mass|payload.*mass"),
-    "link": ({"mass": 1, "link": "hand"}, "unknown link in payload.link: 'hand'"),
-    "field": ({"mass": 1, "weight": 2}, "unknown field of payload: 'weight'"),
-}
 
 
-@pytest.mark.parametrize(("data", "message"), WRONG.values(), ids=WRONG)
-def test_wrong_payloads_are_one_line(data: dict[str, Any], message: str) -> None:
-    refuses(message, problem_from_record, GOOD | {"payload": data})
+def test_wrong_payloads_are_one_line() -> None:
+    for data, message in (
+        ({"mass": -1}, "payload.mass is -1; it must be a number of kg from 0 to 10000"),
+        ({"com": [0, 0, 0]}, "missing field of payload: mass|payload.*mass"),
+        ({"mass": 1, "link": "hand"}, "unknown link in payload.link: 'hand'"),
+        ({"mass": 1, "weight": 2}, "unknown field of payload: 'weight'"),
+    ):
+        refuses(message, problem_from_record, GOOD | {"payload": data})
 
 
 def test_robots_without_inertias_are_refused_by_name() -> None:
     arm = rd.load_robot("iiwa14")
     middle = (arm.lower + arm.upper) / 2
-    with pytest.raises(rd.InputError, match="iiwa14 has no inertia of what moves with joint joint_a1"):
-        rd.Problem(arm, rd.Scene(), middle, middle, payload=rd.Payload(1.0))
+    told = "iiwa14 has no inertia of what moves with joint joint_a1"
+    refuses(told, rd.Problem, arm, rd.Scene(), middle, middle, payload=rd.Payload(1.0))
 
 
 def test_files_keep_payloads(tmp_path: Path) -> None:

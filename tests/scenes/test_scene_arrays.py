@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from numpy import ndarray
 
 import robotdiffuse as rd
 from helpers.refusals import refuses
+from helpers.sphere_oracles import distance
 from robotdiffuse import Box, Capsule, Cylinder, Scene
 from robotdiffuse.core.transforms import rotation_from_quaternion
 from robotdiffuse.datasets.surface_clouds import surface_clouds
@@ -79,29 +79,18 @@ def some_scenes(n: int, k: int, seed: int = 0):
     return PackedScenes(np.pad(drawn.kinds, [(0, 0), (1, 1)]), np.pad(drawn.params, [(0, 0), (1, 1), (0, 0)]))
 
 
-def depths(kinds: ndarray, params: ndarray, points: ndarray) -> ndarray:
-    """Depth [m, 3] of each point inside each shape [k] of a scene [m], negative outside, computed by hand."""
-    out = np.full((len(kinds), len(points)), -np.inf)
-    for i, (kind, row) in enumerate(zip(kinds, params.astype(np.float64), strict=True)):
-        local = points - row[:3]
-        if kind == SPHERE:
-            out[i] = row[3] - np.linalg.norm(local, axis=1)
-        elif kind == BOX:
-            local = local @ rotation_from_quaternion(row[6:])
-            out[i] = (row[3:6] / 2 - np.abs(local)).min(1)
-    return out
-
-
 def test_points_lie_on_surfaces():
     scenes = some_scenes(60, 6)
     clouds, again, other = (surface_clouds(scenes, 200, seeded(seed)) for seed in (0, 0, 1))
     assert clouds.shape == (60, 200, 3) and torch.equal(clouds, again) and not torch.equal(clouds, other)
-    for scene in zip(scenes.kinds, scenes.params, clouds.double().numpy(), strict=True):
-        if not scene[0].any():
-            assert not scene[2].any()
+    for i, cloud in enumerate(clouds.double().numpy()):
+        shapes = scenes.scene(i).shapes
+        if not shapes:
+            assert not cloud.any()
         else:
             # float32 of coordinates of up to 1.5 m
-            np.testing.assert_allclose(np.abs(depths(*scene)).min(0), 0, atol=1e-6)
+            gaps = [np.abs(distance(shape, cloud)) for shape in shapes]
+            np.testing.assert_allclose(np.min(gaps, axis=0), 0, atol=1e-6)
     near = surface_clouds(scenes, 200, seeded(), region=PANDA_REGION).numpy()
     assert PANDA_REGION.holds(near[near.any((1, 2))]).all() and near.any((1, 2)).sum() > 20
 

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from helpers.refusals import refuses
-from robotdiffuse import Box, InputError, Sphere
+from helpers.sphere_oracles import distance
+from robotdiffuse import InputError
+from robotdiffuse.core.transforms import rotation_from_rpy
 from robotdiffuse.problems.families import furniture
 from robotdiffuse.scenes.scene_arrays import BOX, PackedScenes
 from robotdiffuse.scenes.shapes import Shape
@@ -19,16 +21,6 @@ every_family = pytest.mark.parametrize("name", FURNITURE)
 
 def named(furnished: furniture.FurnishedScene, name: str) -> list[Shape]:
     return [shape for shape in furnished.scene.shapes if shape.name.split("_")[0] == name]
-
-
-def gaps(shape: Shape, points: np.ndarray) -> np.ndarray:
-    """Distance of points from the shape, negative inside."""
-    assert isinstance(shape, Sphere | Box)
-    local = points - shape.center
-    if isinstance(shape, Sphere):
-        return np.linalg.norm(local, axis=1) - shape.radius
-    beyond = np.abs(local @ shape.rotation) - shape.size / 2
-    return np.linalg.norm(np.maximum(0, beyond), axis=1) + np.minimum(0, beyond.max(axis=1))
 
 
 @every_family
@@ -46,20 +38,14 @@ def test_scenes_stand_on_the_ground_and_have_free_regions_in_reach(name: str) ->
         boxes = packed.params[packed.kinds == BOX]
         assert (boxes[:, 7:9] == 0).all(), "turned about the vertical only"
         for shape in shapes:
-            assert shape.bounds[0, 2] > -1e-12 and (gaps(shape, BASE[:, :3]) > BASE[:, 3]).all()
+            assert shape.bounds[0, 2] > -1e-12 and (distance(shape, BASE[:, :3]) > BASE[:, 3]).all()
         assert len(furnished.regions) >= 2
         for region in furnished.regions:
             assert (region.size > 0.08).all()
             assert np.linalg.norm(region.center - furniture.SHOULDER) <= family.reach
             assert np.linalg.norm(region.approach) == pytest.approx(1)
-            points = region.center + rng.uniform(-0.5, 0.5, (200, 3)) * region.size @ turned(region.yaw).T
-            assert min(gaps(shape, points).min() for shape in furnished.scene.shapes) > -1e-9
-
-
-def turned(yaw: float) -> np.ndarray:
-    c = np.cos(yaw)
-    s = np.sin(yaw)
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+            points = region.center + rng.uniform(-0.5, 0.5, (200, 3)) * region.size @ rotation_from_rpy(0, 0, region.yaw).T
+            assert min(distance(shape, points).min() for shape in furnished.scene.shapes) > -1e-9
 
 
 @pytest.mark.parametrize("name", ["shelf", "crate", "table"])
@@ -85,7 +71,7 @@ def test_targets_have_the_fingers_in_the_region() -> None:
     T = np.stack([furniture.sample_target(region, rng) for _ in range(1000)])
     products = T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1)
     np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), (1000, 3, 3)), atol=1e-12)
-    local = (T[:, :3, 3] + 0.1 * T[:, :3, 2] - region.center) @ turned(0.7)
+    local = (T[:, :3, 3] + 0.1 * T[:, :3, 2] - region.center) @ rotation_from_rpy(0, 0, 0.7)
     assert (np.abs(local) <= region.size / 2 - furniture.REGION_MARGIN + 1e-12).all()
     assert (np.abs(local).max(axis=0) > 0.95 * (region.size / 2 - furniture.REGION_MARGIN) - 1e-12).all()
     cosines = T[:, :3, 2] @ approach
