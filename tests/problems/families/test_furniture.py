@@ -44,7 +44,7 @@ def test_scenes_stand_on_the_ground_and_have_free_regions_in_reach(name: str) ->
             assert (region.size > 0.08).all()
             assert np.linalg.norm(region.center - furniture.SHOULDER) <= family.reach
             assert np.linalg.norm(region.approach) == pytest.approx(1)
-            points = region.center + rng.uniform(-0.5, 0.5, (200, 3)) * region.size @ rotation_from_rpy(0, 0, region.yaw).T
+            points = region.center + rng.uniform(-0.5, 0.5, (200, 3)) * region.size @ rotation_from_rpy(0.0, 0.0, region.yaw).T
             assert min(distance(shape, points).min() for shape in furnished.scene.shapes) > -1e-9
 
 
@@ -71,7 +71,7 @@ def test_targets_have_the_fingers_in_the_region() -> None:
     T = np.stack([furniture.sample_target(region, rng) for _ in range(1000)])
     products = T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1)
     np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), (1000, 3, 3)), atol=1e-12)
-    local = (T[:, :3, 3] + 0.1 * T[:, :3, 2] - region.center) @ rotation_from_rpy(0, 0, 0.7)
+    local = (T[:, :3, 3] + 0.1 * T[:, :3, 2] - region.center) @ rotation_from_rpy(0.0, 0.0, 0.7)
     assert (np.abs(local) <= region.size / 2 - furniture.REGION_MARGIN + 1e-12).all()
     assert (np.abs(local).max(axis=0) > 0.95 * (region.size / 2 - furniture.REGION_MARGIN) - 1e-12).all()
     cosines = T[:, :3, 2] @ approach
