@@ -299,7 +299,7 @@ def test_parts_that_do_not_fit_are_refused():
         (encoders.PointNetSettings, {"second": (8, 0)}, r"encoder.second\[1\] is"),
         (encoders.DGCNNSettings, {"neighbors": 0}, "encoder.neighbors is 0"),
         (encoders.PointsSettings, {"cloud": 20}, "points.code is 96; it must be three times cloud, 60"),
-        (EncoderTraining, {"name": "pointnet"}, "name is pointnet.*jointly"),
+        (EncoderTraining, {"name": "pointnet"}, "unknown encoder that is trained alone .pointnet.; known"),
         (MotionModelSettings, {"encoder": "points", "encoder_settings": SMALL["points"]}, "need each other"),
     ):
         refuses(message, kind, **({"data": "data"} if kind is PlannerTraining else {}), **parts)
