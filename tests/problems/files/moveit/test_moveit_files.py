@@ -339,10 +339,10 @@ def test_wide_tolerances_of_a_pose_goal_are_noted() -> None:
     data = request_data() | {"goal_constraints": [goal]}
     region = goal["position_constraints"][0]["constraint_region"]
     region["primitives"] = [{"type": "sphere", "dimensions": [0.001]}]
-    assert not moveit_request(data, moveit_frames({}, PANDA)).notes
+    assert not moveit.moveit_request(data, moveit.moveit_frames({}, PANDA)).notes
     region["primitives"] = [{"type": "sphere", "dimensions": [0.1]}]
     goal["orientation_constraints"][0]["absolute_z_axis_tolerance"] = 3.1
-    [note] = moveit_request(data, moveit_frames({}, PANDA)).notes
+    [note] = moveit.moveit_request(data, moveit.moveit_frames({}, PANDA)).notes
     assert "region of 0.1 m, tolerance of 3.1 rad are ignored" in note
 
 
