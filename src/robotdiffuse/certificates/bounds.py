@@ -139,7 +139,8 @@ class Obstacles:
         self._rounding = np.array([body.rounding for _, body in rounded])
 
     def distances(self, points: Points) -> Float[ndarray, "n obstacles"]:
-        """Distances of points to each obstacle [m], at most CLEARANCE_CAP; 0 or less inside."""
+        """Distances of points to each obstacle [m], or lower bounds of them, at most CLEARANCE_CAP; 0 or less
+        inside, except inside a mesh, of which only the surface counts."""
         distances_to_each = np.full((len(points), len(self.bodies)), CLEARANCE_CAP)
         step = max(MAX_ARRAY_SIZE // max(3 * len(self._at), 1), 1)
         for first in range(0, len(points), step):
@@ -366,7 +367,7 @@ class Prover:
         return spans + self.deviations(start, stop)
 
     def deviations(self, start: ndarray, stop: ndarray) -> JointRows:
-        """For each stretch and joint, how far it may leave the straight lines [rad] or [m]."""
+        """How far each joint may leave the straight lines on each stretch [rad] or [m]."""
         if not len(self.off):
             return np.zeros((len(start), self.q.shape[1]))
         first = np.minimum(np.floor(start).astype(int), len(self.off) - 1)
@@ -487,8 +488,9 @@ class Prover:
         Pairs of a part of the link and an obstacle (or a part of the other link) are bounded one by one. The
         clearance of a pair is the greater of two gaps: the one between the ball around the part and the
         obstacle (or the other part's ball), and the widest one that a plane shows. The margin of a pair is a
-        lower bound of its gap anywhere on the stretch, computed in the same way. The results are the smallest
-        clearance, and its difference from the smallest margin.
+        lower bound of its gap anywhere on the stretch: the gap of the balls minus `displacement`, or what the
+        best plane still shows. Returned are the smallest clearance and, as displacement, this clearance minus
+        the smallest margin.
 
         posture: in the middle of the stretch. steps, off: the `_steps` of the joints and their `deviations`.
         displacement: by the covering spheres.
@@ -555,15 +557,15 @@ def gaps(
     part: Part,
     body: Body,
     normals: Float[ndarray, "k 3"],
-    nearer: Float[ndarray, "k v"] | None = None,
+    approach: Float[ndarray, "k v"] | None = None,
 ) -> Float[ndarray, "*elements k"]:
     """Widths of the gaps that planes with these unit normals show between a part and a body [m].
 
-    For a surface, one width per element. nearer: how far each vertex of the part has moved against each
-    normal [m]; None: not at all.
+    For a surface, one width per element. approach: upper bound of how far each vertex of the part may move
+    against each normal [m]; None: it does not move.
     """
     heights = normals @ part.vertices.T
-    nearest = (heights if nearer is None else heights - nearer).min(axis=1) - part.rounding
+    nearest = (heights if approach is None else heights - approach).min(axis=1) - part.rounding
     return nearest - body.reach(normals)
 
 
@@ -599,13 +601,13 @@ def _parts(robot: Robot, link: str) -> tuple[Part, ...]:
 
 
 class MovingProver(Prover):
-    """Computes bounds for a robot among moving obstacles, along straight lines through configurations at
-    given times or within a known distance of the lines.
+    """Computes bounds for a robot among moving obstacles, for a motion that is at given configurations at
+    given times, and between them on straight lines or within a known distance of these.
 
     The clearance of a stretch is that of the link's spheres at its middle, with the obstacle where it is at
     that time. The displacement is the sum of the displacements of the link and of the obstacle from the
-    middle to either end. An obstacle with unknown motion is placed where it is at time 0, and its
-    displacement counts from then.
+    middle to anywhere on the stretch. An obstacle with unknown motion is placed where it is at time 0, and
+    its displacement counts from then.
     """
 
     def __init__(

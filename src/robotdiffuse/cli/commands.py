@@ -55,7 +55,7 @@ PLANNING = (
             (
                 "--weights FOLDER",
                 "weights of a learned planner: a folder of `robotdiffuse train`, or panda_points, bundled "
-                "weights without clearances as inputs (default: those trained for the robot, or bundled)",
+                "weights of a network that gets no clearances (default: those for the robot)",
             ),
             (
                 "--set NAME=VALUE *",
@@ -72,7 +72,7 @@ PLANNING = (
             IGNORE_JOINTS,
             (
                 "--next-view",
-                "propose a camera pose that shows most of the unknown space that the motion crosses",
+                "propose the camera pose that shows the most of the unknown space that the motion crosses",
             ),
             (
                 "--blend R",

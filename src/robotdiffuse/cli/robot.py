@@ -109,7 +109,7 @@ def print_preparation(report: "AddReport") -> None:
         ("convex parts, spheres", f"{parts}, {report.sphere_count}"),
         ("configurations free of self-collision", f"{falsely.free:.1%}"),
         (
-            "of these false collisions by convex parts, by spheres",
+            "of these in false collision by convex parts, by spheres",
             f"{falsely.by_parts:.1%}, {falsely.by_spheres:.1%}",
         ),
         ("processor time, memory", f"{report.seconds:.0f} s, {report.memory / 2**20:.0f} MiB"),
@@ -124,7 +124,8 @@ def print_preparation(report: "AddReport") -> None:
 
 
 def _print_pairs(report: "AddReport") -> None:
-    """Print the number of allowed pairs of links by reason, and where they differ from the SRDF."""
+    """Print the number of pairs of links that are checked, and of those allowed for each reason, and where
+    they differ from the SRDF."""
     reasons = Counter(pair.reason for pair in report.pairs)
     counted = ", ".join(f"{reason} {count}" for reason, count in sorted(reasons.items()))
     show(Table.pairs("", [("pairs of links", counted)]))

@@ -294,9 +294,9 @@ class ExactCollision:
         """Signed distance of two grazing links [m], at most `cutoff`.
 
         It is the distance of their convex parts, or the distance of their mesh surfaces if that is larger.
-        The surfaces count only if the parts overlap by at most MAX_OVERLAP or are nearer than SURFACES_BELOW,
-        and if the surfaces neither touch nor enclose a piece of each other. Without `depth`, the penetration
-        may be too small, but the sign is right.
+        The surfaces count only if the signed distance of the parts is between -MAX_OVERLAP and
+        SURFACES_BELOW, and if the surfaces neither touch nor enclose a piece of each other. Without `depth`,
+        the penetration may be too small, but the sign is right.
         """
         assert candidates.surfaces is not None
         best, _ = self._closest(candidates, frames, cutoff, -np.inf if depth else -MAX_OVERLAP, depth=True)

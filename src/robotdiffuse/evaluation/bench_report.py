@@ -112,7 +112,7 @@ def title(section: Section, comparison: Comparison) -> str:
 
 
 def tables(section: Section, comparison: Comparison, reference: str) -> list[Table]:
-    """All tables of a comparison, without empty ones."""
+    """The tables of a comparison, without those that have no rows or only one column besides the planner."""
     name = title(section, comparison)
     reasons = [reason for reason in FAILURES if any(reason in row.failures for row in comparison.rows)]
     compared_rows = [row for row in comparison.rows if row.paired is not None]
@@ -224,7 +224,7 @@ def probability(p: float) -> str:
 
 
 def success_over_time(section: Section, planners: Sequence[str]) -> str:
-    """Draw the share of solved problems over time, as in the paper's figure 3a; returns SVG."""
+    """Draw the share of solved calls over time, as in the paper's figure 3a; returns SVG."""
 
     def steps(curve: Curve) -> tuple[ndarray, ndarray]:
         solved = np.arange(len(curve.found) + 1)
@@ -414,8 +414,9 @@ def _detour(record: Record) -> float:
 
 
 def _failure(case: Case, solved: list[Record], failed: dict[str, str], reference: str) -> Iterator[Replay]:
-    """A replay of a problem on which a planner failed: another planner's motion, or the straight line if none
-    solved it. Yields nothing if no planner failed."""
+    """A replay of a problem on which a planner failed: another planner's motion, or, if none
+    solved it, the straight line to a joint goal. Yields nothing if no planner failed, or for an unsolved
+    problem with another goal."""
     goal = case.problem.goal
     if failed and solved:
         loser = reference if reference in failed else next(iter(failed))

@@ -22,7 +22,8 @@ MIN_GAIN = np.float32(1e-3)
 REMOVE_SHARE = np.float32(0.1)
 """Tightening draws a number from 0 to 1 for each attempt. Below this number, it removes a waypoint."""
 PULL_SHARE = np.float32(0.35)
-"""Below this number, tightening moves a waypoint towards the chord of its neighbors; above it, at random."""
+"""From REMOVE_SHARE on, tightening moves a waypoint towards the chord of its neighbors; from this number on,
+a random move is added."""
 MAX_RANDOM_MOVE = np.float32(0.3)
 """Largest scale of random moves of a waypoint, in each joint [rad]."""
 RANDOM_MOVE_LOG_RANGE = np.float32(5.0)

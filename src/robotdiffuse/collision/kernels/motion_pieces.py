@@ -33,8 +33,8 @@ class Pieces(NamedTuple):
 
 @kernel()
 def travel_along(q, motion_radii):
-    """`Motion.travel` [n] of the waypoints q[n, dof]: the sum over segments of the motion bound of the check
-    that moves most. `motion_radii` [checks, dof] are bounds per unit of joint motion."""
+    """`Motion.travel` [n] of the waypoints q[n, dof]: the sum over segments of the largest motion bound of
+    any check. `motion_radii` [checks, dof] are bounds per unit of joint motion."""
     travel = np.zeros(len(q))
     for i in range(1, len(q)):
         link_travel = 0.0
@@ -49,8 +49,8 @@ def travel_along(q, motion_radii):
 
 @kernel()
 def segment_at(travel, at):
-    """The last waypoint at or before a place, and the fraction of the segment from this waypoint to the
-    next."""
+    """The waypoint at which the segment of a place begins (at the end of the motion, the last segment), and
+    the fraction of this segment."""
     low = min(max(np.searchsorted(travel, at, side="right") - 1, 0), max(len(travel) - 2, 0))
     if low + 1 >= len(travel) or travel[low + 1] <= travel[low]:
         return low, 0.0

@@ -91,7 +91,7 @@ def plan_with_unknown_space(
     completion network predicts it if the policy needs it.
     unknown: the space that no view saw; None: computed from the problem's views. A caller
     that has put the observed points into the scene, as `Explorer` does, may give it under the policies padded
-    and predicted; then the views are not evaluated.
+    and predicted; then no volume is computed from the views.
 
     The result states the assumption, the confidence (the probability that the motion is free in the true
     scene), and the unknown space that the motion crosses.
@@ -145,7 +145,7 @@ def plan_with_unknown_space(
             until = limit if occupied_only else context.elapsed + share
             result = attempts.best(assumed, assumption.name, until)
             if occupied_only and not result.solved:
-                why = "every motion that was found crosses space that no view saw"
+                why = "no motion was found that avoids all space that no view saw"
                 return _with_notes(context, replace(result, reason=f"{why}: {result.reason}"))
             if occupied_only or result.solved:
                 return _with_notes(context, result, policy_note, _failed_note(failed, assumption.name))
@@ -258,8 +258,9 @@ class _Attempts:
     planner: Solver
     context: PlanningContext
     unknown: UnknownSpace
-    most: float
-    """Largest confidence: an image of a wrong camera may show other space as free."""
+    max_confidence: float
+    """Upper limit of the confidence, lowered if a camera seems misplaced: its images may then show occupied
+    space as free."""
 
     def best(self, problem: Problem, assumption: str, until: float) -> PlanResult:
         """A motion found before `until` [s since the call], or the result that says why there is none.
@@ -309,6 +310,6 @@ class _Attempts:
             result,
             notes=(*result.notes, blind) if crossed.unseen_share > MAX_UNSEEN_SHARE else result.notes,
             assumption=assumption,
-            confidence=min(confidence(assumption, crossed), self.most),
+            confidence=min(confidence(assumption, crossed), self.max_confidence),
             swept_probability=crossed.risk,
         )

@@ -379,8 +379,8 @@ class AnytimeSearch:
     def refuse(self, accepted: Configurations | None) -> None:
         """Go back to the last valid path after the validator refused the best path, and halve the resolution.
 
-        At the finest resolution, paths are not shortened any more, because shortening could lead to the
-        refused path again.
+        At the finest resolution, paths are not simplified any more, because this could lead to the refused
+        path again; those about as short as the valid path are still tightened.
 
         Args:
             accepted: The last valid path [n, dof]; None: there is none.
@@ -515,9 +515,9 @@ class _Validation:
         self.best: PlanResult | None = None
         self._path: ndarray | None = None
         self._shortest: PlanResult | None = None
-        """Result of `_path`, the last best path of the search that was valid."""
+        """Result of `_path`, the last path of the search that passed validation."""
         self._timed = list[ndarray]()
-        """The paths of the search that were validated."""
+        """The paths of the search that were validated, whether they passed or not."""
         self._validated_at = 0
         self._late = False
         """Whether a path was validated after the time for searching had run out."""
@@ -536,10 +536,10 @@ class _Validation:
         return motions.best.time < (1 - MIN_TIME_GAIN) * _duration(self.best)
 
     def run(self) -> bool:
-        """Validate the best path of the search; if it is refused, the search goes back to its last valid
-        path.
+        """Validate the best path of the search, or, after the first valid result, the fastest candidate. If a
+        path is refused, the search goes back to its last valid path.
 
-        Returns whether there is a valid path to return.
+        Returns False if it went back, or if nothing valid was found in time.
         """
         search = self.search
         motions = search.motions
@@ -559,12 +559,12 @@ class _Validation:
         return False
 
     def run_last(self) -> None:
-        """Choose the final result. If the objective is time, it is the fastest of the best candidates'
-        motions and of the motion along the shortest path; otherwise, paths under constraints that were not
+        """Choose the final result. If motions are optimized, it is the fastest of the best candidates'
+        motions and of the motion along the shortest path. Under path constraints, paths that were not
         validated yet are tried.
 
-        If the objective is time, earlier results count only if time ran out: which paths were validated
-        earlier depends on the clock, and the same seed must give the same result.
+        If motions are optimized, earlier results count only if time ran out or nothing else is valid: which
+        paths were validated earlier depends on the clock, and the same seed must give the same result.
         """
         search = self.search
         motions = search.motions
