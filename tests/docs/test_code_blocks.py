@@ -114,7 +114,7 @@ def test_planners_solve_and_are_validated(names: dict[str, Any]) -> None:
 
 def test_parts_of_the_learned_stack_are_used_by_name_and_a_metric_is_measured(names: dict[str, Any]) -> None:
     assert names["training"].denoiser == "by_waypoint" and names["motions"].shape == (2, 48, 7)
-    assert names["code"].shape == (5, names["encoder"].settings.code)
+    assert names["embedding"].shape == (5, names["encoder"].settings.code)
     at_once = names["at_once"]
     assert at_once.planner == "diffusion" and "samples of the network" in at_once.reason
     assert names["values"]["steps"] == 2

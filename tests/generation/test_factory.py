@@ -366,10 +366,9 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(undisturbed, tm
         assert factory_runs.shards(tmp_path) == 2 and len(list(tmp_path.iterdir())) == 3
         with pytest.raises(OutputError, match=r"manifest\.json.*: File too large$"):
             generate(MANY, tmp_path / "other")
-        assert not list((tmp_path / "other").iterdir())
+        assert not (tmp_path / "other").exists()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, most)
-    (tmp_path / "other").rmdir()
     generate(MANY, tmp_path)
     assert factory_runs.contents(tmp_path) == undisturbed
 

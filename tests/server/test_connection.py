@@ -200,4 +200,4 @@ def test_the_work_for_a_body_in_pieces_grows_with_their_number() -> None:
     scope = {"type": "http", "method": "POST", "headers": [(b"content-type", JSON.encode())]}
     pool = WorkerPool({}, ServeSettings(max_request_size=300))
     assert asyncio.run(read_body(Request(scope, receive), pool, JSON)) == b"x" * 300
-    assert pool.arriving == 0 and Piece.asked < 3000
+    assert pool.arriving_bytes == 0 and Piece.asked < 3000

@@ -305,6 +305,14 @@ def test_rates_that_are_not_those_of_the_positions(factor: float) -> None:
     assert found.keys() == {"rates"} and "accel" in found["rates"]
 
 
+def test_the_rate_in_a_message_has_its_sign() -> None:
+    good = trajectory(1.0)
+    ways = (good.positions, good.positions[::-1])
+    messages = [wrong_rates(replace(good, positions=q, velocities=0 * q, accelerations=0 * q))["rates"] for q in ways]
+    there, back = (float(message.split(" is ")[1].split(",")[0]) for message in messages)
+    assert there == pytest.approx(-back, rel=1e-3)
+
+
 @pytest.mark.parametrize("end", [0, -1])
 def test_motions_begin_and_end_at_rest(end: int) -> None:
     """By their velocities and, if these are 0, by their positions."""

@@ -221,7 +221,7 @@ class Claim(NamedTuple):
     link: str
     against: str
     """SCENE, the name of a moving obstacle, or the name of the other link. Of two links, `link` is
-    moved by at least as many joints."""
+    the one that at least as many joints move as the other."""
 
 
 class Stretches(NamedTuple):
@@ -278,8 +278,8 @@ class Bounds:
     clearance: Values
     """Lower bound of the clearance in the middle of the stretch [m], at most CLEARANCE_CAP."""
     displacement: Values
-    """Upper bound of the displacement of any point of the link from the middle to anywhere on the stretch
-    [m]."""
+    """Upper bound of how much of the clearance is lost anywhere on the stretch, by motions of the link and of
+    the other body [m]."""
 
 
 Body = Rounded | Surface | Part
@@ -488,9 +488,9 @@ class Prover:
         Pairs of a part of the link and an obstacle (or a part of the other link) are bounded one by one. The
         clearance of a pair is the greater of two gaps: the one between the ball around the part and the
         obstacle (or the other part's ball), and the widest one that a plane shows. The margin of a pair is a
-        lower bound of its gap anywhere on the stretch: the gap of the balls minus `displacement`, or what the
-        best plane still shows. Returned are the smallest clearance and, as displacement, this clearance minus
-        the smallest margin.
+        lower bound of its gap anywhere on the stretch: the greater of the balls' gap minus `displacement`,
+        and the gap that the best plane shows all along the stretch. Returned are the smallest clearance and,
+        as displacement, this clearance minus the smallest margin.
 
         posture: in the middle of the stretch. steps, off: the `_steps` of the joints and their `deviations`.
         displacement: by the covering spheres.

@@ -24,7 +24,7 @@ class Column:
     heading: str
     unit: str = ""
     format: str = ""
-    """Format of numbers, such as `.2f`; empty: all digits."""
+    """Format of numbers, such as `.2f`; empty: integers in full, others with six significant digits."""
     better: Literal["more", "less", ""] = ""
     """Whether the largest or the smallest value is the best, which is marked; "": no value is marked."""
     left: bool = False
@@ -161,7 +161,8 @@ def show(*tables: Table, width: int | None = None) -> None:
 
 
 def pair_lines(table: Table, width: int) -> list[str]:
-    """Lines of a table of pairs with its title, of at most `width` characters."""
+    """Lines of a table of pairs with its title; texts are wrapped to `width` characters, if it is not too
+    small."""
     margin = max((len(name) for name, _ in table.texts), default=0) + 2
     lines = [table.title] if table.title else []
     for name, text in table.texts:
@@ -202,5 +203,5 @@ def markdown(table: Table) -> list[str]:
 
 
 def plain(text: str) -> str:
-    """The text with Markdown's special characters escaped, except underscores within a word."""
+    """The text with \\, |, *, <, backticks and underscores escaped, except underscores within a word."""
     return re.sub(r"[\\|*<`]|(?<!\w)_|_(?!\w)", r"\\\g<0>", text)

@@ -1,5 +1,5 @@
-"""Methods for `runs`: planners, and samplers of trajectories: networks, or controls, which are baselines
-without a network. Each method yields the fields of its records, including the validator's verdict.
+"""Methods for `runs`: planners, and samplers of trajectories, which are networks or controls (baselines
+without a network). Each method yields the fields of its records, including the validator's verdict.
 
 The time of a planner's call includes its validation; the time of sampling does not include validation.
 """
@@ -93,11 +93,11 @@ def restarted(
     first: PlanResult,
     request: Mapping[str, Any],
 ) -> tuple[int, PlanResult]:
-    """Call a planner again with new seeds until all its calls together have used up the time limit.
+    """Call a planner again with new seeds until less time is left than its shortest call took.
 
     Returns the number of further calls and the result with the shortest path. Its `progress` has the times at
-    which paths were found, over all calls. Stops early if no shorter path can exist. Time that calls spend on
-    computing trajectories is not counted.
+    which shorter paths were found, over all calls. Stops early if no shorter path can exist. The final timing
+    of each call's path is not counted.
     """
     straight = 0.0
     if isinstance(problem.goal, JointGoal):
@@ -222,7 +222,7 @@ def from_network(
         sampler: The planner with the network.
         encoded: Returns a problem for a run; the scene of this problem is encoded in place of the scene of
             the run.
-        clearances: Replaces the function that computes the clearances, inputs of the denoiser.
+        clearances: Computes the clearances that are inputs of the denoiser, in place of the usual function.
     """
 
     def draw(run: Run, checker: CollisionChecker) -> ndarray:

@@ -75,9 +75,10 @@ class MotionNetwork(Network, MotionModel):
         return Statistics(*(getattr(self, name).numpy() for name in Statistics._fields))
 
     def fit_statistics(self, q: Float[ndarray, "n waypoints dof"], smooth_noise: bool) -> None:
-        """Set, from trajectories [rad], the scale of residuals, their mean and the covariance of the noise.
+        """Set, from trajectories [rad], the scale of residuals, their mean (0 unless the target is
+        `absolute`) and the factor of the noise.
 
-        Nothing is set for the target `limits`, joint values in units of their limits.
+        Sets nothing for the target `limits`, for which x is the joint values in units of their limits.
         """
         if self.settings.target == "limits":
             return
@@ -138,10 +139,10 @@ class MotionNetwork(Network, MotionModel):
         dropped: Dropped | None = None,
     ) -> Outputs:
         """See `MotionModel`."""
-        hidden = None if dropped is None else torch.from_numpy(dropped)
+        dropped_mask = None if dropped is None else torch.from_numpy(dropped)
         with torch.inference_mode():
             inputs = torch.from_numpy(features), torch.from_numpy(level), torch.from_numpy(condition)
-            return self.denoise(*inputs, hidden).numpy()
+            return self.denoise(*inputs, dropped_mask).numpy()
 
     def embedding_of(self, cloud: Cloud) -> Embedding:
         """See `MotionModel`."""
@@ -172,5 +173,6 @@ class MotionNetwork(Network, MotionModel):
         base: Float[Tensor, "n waypoints dof"],
         at: list[int],
     ) -> Float[Tensor, "n {len(at)} dof"]:
-        """Joint values [rad] of the waypoints with these indices, differentiable in x."""
+        """Joint values [rad] of the waypoints with indices `at`, differentiable in x. base:
+        `Reference.base`."""
         return self.from_unit(base[:, at] + x[:, at] * self.residual_scale)

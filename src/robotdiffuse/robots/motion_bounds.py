@@ -111,8 +111,8 @@ def _directions() -> Float[ndarray, "rows columns 3"]:
 def _rotated(
     support: Float[ndarray, "n rows columns"], lower: float, upper: float
 ) -> Float[ndarray, "n rows columns"]:
-    """For each longitude, the largest grid value among the longitudes that rotations by angles in [lower,
-    upper] map to it."""
+    """For each longitude c, the largest grid value at longitudes from c - upper to c - lower, widened to
+    whole steps."""
     first = -int(np.ceil(upper / STEP))
     width = -int(np.floor(lower / STEP)) - first + 1
     if width >= COLUMNS:

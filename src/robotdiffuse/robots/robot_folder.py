@@ -2,8 +2,8 @@
 if links graze each other, surfaces.npz.
 
 surfaces.npz contains the mesh surfaces of grazing links (`Robot.grazing`). The file is optional and not part
-of a robot's identity. Surfaces only make more configurations count as free: some of those in which convex
-parts overlap. So data, weights and proofs that were made without the file stay valid.
+of a robot's identity. Surfaces can only make more configurations count as free: those in which convex
+parts overlap but surfaces do not. So data, weights and proofs that were made without the file stay valid.
 """
 
 import hashlib

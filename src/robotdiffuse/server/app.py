@@ -498,15 +498,15 @@ async def read_body(request: Request, pool: WorkerPool, kind: str) -> bytes:
     try:
         async for part in request.stream():
             body += part
-            pool.arriving += len(part)
+            pool.arriving_bytes += len(part)
             if len(body) > max_size:
                 raise too_large
-            if pool.arriving > MAX_ARRIVING * max_size:
+            if pool.arriving_bytes > MAX_ARRIVING * max_size:
                 raise RequestError(429, "too many requests are arriving")
     except ClientDisconnect:
         raise RequestError(CLIENT_GONE, "the client closed the connection") from None
     finally:
-        pool.arriving -= len(body)
+        pool.arriving_bytes -= len(body)
     return bytes(body)
 
 

@@ -23,7 +23,7 @@ INITIAL_REQUEST_SECONDS = 0.5
 STOPPING = "the server is stopping"
 GAUGES = {
     "workers": "Worker processes.",
-    "workers_ready": "Workers that can take requests.",
+    "workers_ready": "Workers that are prepared, idle or busy.",
     "workers_busy": "Workers that answer a request.",
     "requests_waiting": "Requests that wait for a worker.",
 }
@@ -53,11 +53,11 @@ class WorkerPool:
         self.settings, self.metrics = settings, Metrics()
         self.admitted = 0
         """Number of requests that wait or run."""
-        self.arriving = 0
-        """Received data of requests that have not arrived completely [bytes]."""
+        self.arriving_bytes = 0
+        """Data received so far of requests that are still arriving [bytes]."""
         self.stopping = False
-        bare = {name: replace(robot) for name, robot in robots.items()}  # without compiled arrays
-        self._workers = Workers(settings.workers, worker.prepare, (bare, settings), 0.0, keep_ready=True)
+        copies = {name: replace(robot) for name, robot in robots.items()}  # without compiled arrays
+        self._workers = Workers(settings.workers, worker.prepare, (copies, settings), 0.0, keep_ready=True)
         self._request_seconds = INITIAL_REQUEST_SECONDS
         for name, description in GAUGES.items():
             self.metrics.gauge(name, description, lambda name=name: self.state()[name])
@@ -118,7 +118,7 @@ class WorkerPool:
         return answer
 
     def _count_worker(self, call: Future[Answer]) -> None:
-        """Count the call's worker if it was lost or is renewed. The worker's thread calls this function."""
+        """Count the call's worker if it was lost or is renewed. The thread that ends the call calls this."""
         if call.cancelled():
             return
         if isinstance(call.exception(), EndedError):
@@ -138,7 +138,7 @@ class WorkerPool:
 
     @property
     def ready(self) -> int:
-        """Workers that can take requests."""
+        """Number of workers that are prepared, idle or busy."""
         return sum(worker.ready for worker in self._workers.workers)
 
     def state(self) -> dict[str, int]:

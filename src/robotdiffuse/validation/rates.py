@@ -9,7 +9,8 @@ rest before the first row (or to move at the problem's start velocity) and after
 Rates agree with the positions if some motion within the limits has these rates and positions. If a joint's
 velocity changes from v0 to v1 in a step of h seconds with accelerations up to A, it moves by h (v0 + v1) / 2
 ± (A h² - (v1 - v0)² / A) / 4. The extremes are full acceleration followed by full braking, and the reverse. A
-is twice the greatest acceleration in the motion, by rows or by positions, but at most the limit. The
+is twice the greatest acceleration in the motion, by rows, positions or velocities, but at most the limit with
+its tolerance. The
 acceleration of a row must be near those of the cubics before and after the row.
 
 Positions have a limited resolution, which hides any velocity over a step of nanoseconds. If rows are closer
@@ -64,7 +65,7 @@ def rate_violations(
             time = float(trajectory.times[i])
             if check.kind not in first_violations or time < first_violations[check.kind].time:
                 name = robot.joint_names[j]
-                rate = abs(float(check.rates[i, j]))
+                rate = float(check.rates[i, j]) if check.kind == "rates" else abs(float(check.rates[i, j]))
                 message = f"{name} at {time:.3f} s: its {check.what} is {rate:.6g}, {check.expected(i, j)}"
                 first_violations[check.kind] = Violation(
                     check.kind, time, message, name, None, float(beyond[i, j])
@@ -80,7 +81,7 @@ class _Check(NamedTuple):
     """The rate in words."""
     rates: JointRows
     deviation: JointRows
-    """Deviation of the rates from the expected value (0 for limits)."""
+    """Deviation of the rates from the expected value; for limits, the absolute rates."""
     allowed: Float[ndarray, "#n dof"]
     """Allowed deviation."""
     expected: Callable[[int, int], str]
@@ -126,8 +127,9 @@ def _checks(
     yield limited("velocity", rate_name, cubics.extremes.velocity, 1.5 * mean_error)
     yield limited("velocity", "velocity", v)
 
-    # Second differences of positions. The first step is mirrored before the first row, and the last step
-    # after the last row, so that the mean velocity of a step and its mirror image is `initial_velocity` or 0.
+    # Second differences of positions. A step as long as its neighbor is added at each end. Its mean velocity
+    # is
+    # such that the two average to `initial_velocity` (before the first row) or 0 (after the last).
     means = _padded(2 * initial_velocity - mean[:1], mean, -mean[-1:])
     durations = _padded(step[:1], step, step[-1:])
     uncertainty = _padded(mean_error[:1], mean_error, mean_error[-1:])
