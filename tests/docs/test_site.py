@@ -13,6 +13,7 @@ import pytest
 from helpers.browsers import CHROMIUM, opened
 
 ROOT = Path(__file__).parents[2]
+PARAGRAPH = re.compile(r"<p>(.*?)</p>", re.DOTALL)
 LOADED = re.compile(r'<(?:script|img|iframe|source)[^>]*\ssrc="(?:https?:)?//|<link[^>]*stylesheet[^>]*//')
 
 
@@ -31,6 +32,13 @@ def test_pages_load_nothing_from_the_network(site: Path) -> None:
     pages = sorted(site.rglob("*.html"))
     assert len(pages) > 20
     assert [page.name for page in pages if LOADED.search(page.read_text(encoding="utf-8"))] == []
+
+
+@pytest.mark.slow
+def test_no_list_is_drawn_as_a_paragraph(site: Path) -> None:
+    paragraphs = [(page.name, text) for page in site.rglob("*.html") for text in PARAGRAPH.findall(page.read_text("utf-8"))]
+    assert len(paragraphs) > 500
+    assert [(name, text) for name, text in paragraphs if re.search(r"\n\s*([-*]|\d+\.) ", text)] == []
 
 
 @pytest.mark.slow
