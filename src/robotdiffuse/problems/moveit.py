@@ -516,10 +516,7 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
     joint_goals = ()
     pose_goal = None
     if len(goals) == 1 and goals[0][1].get("position_constraints"):
-        pose_goal = _pose_goal(*goals[0], frames)
-        wide = _wide_tolerances(goals[0][1])
-        if wide:
-            notes.append(f"goal_constraints[0]: its {joined(wide)} are ignored: the goal is the pose itself")
+        pose_goal = _pose_goal(*goals[0], frames, notes)
     else:
         joint_goals = tuple(_joint_goal(*goal) for goal in goals)
     return MoveItRequest(start, joint_goals, pose_goal, attached, tuple(notes))
@@ -546,12 +543,8 @@ def _joint_goal(where: str, goal: dict[str, Any]) -> dict[str, float]:
     }
 
 
-def _wide_tolerances(goal: dict[str, Any]) -> list[str]:
+def _wide_tolerances(region: dict[str, Any], orientation: dict[str, Any]) -> list[str]:
     """The tolerances of a pose goal that permit much more than the validator does."""
-    [(at, position)], [(_, orientation)] = (
-        mappings_of("", goal, f"{kind}_constraints") for kind in ("position", "orientation")
-    )
-    region = mapping_of(at, position, "constraint_region")
     shapes = mappings_of("", region, "primitives")
     sizes = [size for _, shape in shapes for size in list_of("", shape, "dimensions")]
     angles = [orientation.get(f"absolute_{axis}_axis_tolerance", 0) for axis in "xyz"]
@@ -564,7 +557,10 @@ def _wide_tolerances(goal: dict[str, Any]) -> list[str]:
     return wide
 
 
-def _pose_goal(where: str, goal: dict[str, Any], frames: MoveItFrames) -> tuple[str, ndarray]:
+def _pose_goal(
+    where: str, goal: dict[str, Any], frames: MoveItFrames, notes: list[str]
+) -> tuple[str, ndarray]:
+    """The link and its goal pose T_base_link. A note on large tolerances is added to `notes`."""
     positions, orientations = (
         mappings_of(f"{where}.", goal, f"{kind}_constraints") for kind in ("position", "orientation")
     )
@@ -578,10 +574,14 @@ def _pose_goal(where: str, goal: dict[str, Any], frames: MoveItFrames) -> tuple[
         )
     if xyz_of("target_point_offset", position.get("target_point_offset") or [0, 0, 0]).any():
         raise InputError(f"{at}.target_point_offset must be zero")
-    region = "constraint_region"
-    poses = mappings_of(f"{region}.", mapping_of(at, position, region), "primitive_poses")
+    name = "constraint_region"
+    region = mapping_of(at, position, name)
+    poses = mappings_of(f"{name}.", region, "primitive_poses")
     if len(poses) != 1:
-        raise InputError(f"{where}: {region} has {len(poses)} primitive_poses; it must have one")
+        raise InputError(f"{where}: {name} has {len(poses)} primitive_poses; it must have one")
+    wide = _wide_tolerances(region, orientation)
+    if wide:
+        notes.append(f"{where}: its {joined(wide)} are ignored: the goal is the pose itself")
     T_base_region = frames.of_header("header", position) @ pose_of(*poses[0])
     T_frame_goal = pose_of(where, {"position": [0, 0, 0], "orientation": orientation.get("orientation")})
     T_base_goal = frames.of_header("header", orientation) @ T_frame_goal
