@@ -112,6 +112,12 @@ def test_an_arm_of_five_joints_plans_with_its_trained_network(tmp_path: Path) ->
     assert weights_for("model", replace(rd.load_robot("ur5e"), name="so101")) is None
 
 
+@pytest.mark.parametrize("kind", ["planner", "baseline mpnet"])
+def test_the_folder_is_checked_before_the_data_are_read(kind: str, tmp_path: Path, said: Said) -> None:
+    (tmp_path / "file").touch()
+    assert "it is a file" in said(2, "train", *kind.split(), "--data", tmp_path / "missing", "--out", tmp_path / "file")
+
+
 def test_data_are_in_the_size_of_the_arm() -> None:
     large, small = (data_settings(name, rd.load_robot(name), None, None) for name in ("ur5e", "so101"))
     assert large.search.safety_distance == 0.05 and small.search.safety_distance == pytest.approx(0.02)

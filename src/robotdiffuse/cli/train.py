@@ -11,7 +11,7 @@ from typing import Any
 from robotdiffuse.cli.arguments import Namespace, chosen
 from robotdiffuse.cli.console import progress
 from robotdiffuse.core.errors import InputError, needs, shown
-from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.output_files import lock_folder, write_atomically
 from robotdiffuse.generation import GenerationSettings, generate
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
 from robotdiffuse.learning.weight_files import BUNDLED, user_weights
@@ -52,12 +52,14 @@ MODEL_OPTIONS = (
 def run_encoder(arguments: Namespace) -> None:
     options = chosen(arguments, ("name", "scenes", "device", *TRAINING_OPTIONS))
     settings = EncoderTraining(**one_length(options))
+    _check_folder(arguments.out)
     _print_report(train_encoder(settings, arguments.out), arguments.out)
 
 
 def run_completion(arguments: Namespace) -> None:
     options = chosen(arguments, ("families", "robot", "workers", "weights", "device", *TRAINING_OPTIONS))
     settings = CompletionTraining(**one_length(options))
+    _check_folder(arguments.out)
     _print_report(train_completion(settings, arguments.out), arguments.out)
 
 
@@ -99,6 +101,7 @@ def run_planner(arguments: Namespace) -> None:
     if bundled:
         options["encoder"] = str(Path(arguments.out) / "encoder")
     settings = planner_training(arguments.config, options)
+    _check_folder(arguments.out)
     folder = Path(arguments.out)
     new = bundled and copy_bundled_encoder(folder / "encoder")
     try:
@@ -112,6 +115,7 @@ def run_planner(arguments: Namespace) -> None:
 
 def run_baseline(arguments: Namespace) -> None:
     options = chosen(arguments, ("data", "robot", *TRAINING_OPTIONS))
+    _check_folder(arguments.out)
     if arguments.name == "trajectory_prior":
         report = train_planner(planner_training(arguments.name, options), arguments.out)
     else:
@@ -121,6 +125,13 @@ def run_baseline(arguments: Namespace) -> None:
 
 def run_export(arguments: Namespace) -> None:
     print(f"wrote the ONNX files of {', '.join(export_weights(arguments.folder))} into {arguments.folder}")
+
+
+def _check_folder(out: str) -> None:
+    """Raise InputError if the folder cannot be written, before the data are read or generated."""
+    if int(os.environ.get("RANK", "0")) == 0:
+        with lock_folder(Path(out)):
+            pass
 
 
 def _print_report(figures: dict[str, float], out: str) -> None:
