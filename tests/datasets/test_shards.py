@@ -183,7 +183,7 @@ def test_manifest(tmp_path):
         ({"format": 2}, r"manifest\.json: format is 2; this version reads 1"),
         ({"wings": 2}, r"manifest\.json is damaged: .*wings"),
         ({"lower": [0.0]}, r"manifest\.json is damaged: joint_names, lower and upper"),
-        ({"floors": {}}, r"manifest\.json is damaged: floors are of \[\]; they must be of \['rop'\]"),
+        ({"floors": {}}, r"manifest\.json is damaged: floors names \[\], but families \['rop'\]"),
         ({"floors": {"rop": {"size": [2.0, 2.0, 0.1]}}}, r"manifest\.json is damaged: .*center"),
     ]:
         (tmp_path / "manifest.json").write_text(json.dumps(data | change))

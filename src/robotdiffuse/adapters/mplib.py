@@ -62,6 +62,8 @@ class Planner:
         urdf: The robot's URDF, prepared on first use, in about a minute; or the name of a bundled robot.
         move_group: The link that goal poses refer to.
         package_keyword_replacement: The folder that replaces `package://` in the URDF.
+        new_package_keyword: Another name for `package_keyword_replacement`.
+        objects: Must be empty; obstacles are added by `workspace.add`.
         srdf: SRDF with pairs of links that need no check; "": these pairs are found by sampling.
         user_link_names: Ignored: links have the names of the URDF.
         user_joint_names: Joints in the order of `qpos`; none: the planned joints.
@@ -83,10 +85,14 @@ class Planner:
         user_joint_names: Sequence[str] = (),
         joint_vel_limits: ArrayLike = (),
         joint_acc_limits: ArrayLike = (),
+        new_package_keyword: str = "",
+        objects: Sequence = (),
         **_: Any,
     ) -> None:
+        if len(objects):
+            raise InputError("objects must be empty; add obstacles by `planner.workspace.add(rd.Box(...))`")
         check_list("user_joint_names", user_joint_names, str, "names of joints")
-        robot = _robot(urdf, move_group, srdf, package_keyword_replacement)
+        robot = _robot(urdf, move_group, srdf, package_keyword_replacement or new_package_keyword)
         self.joint_names = tuple(user_joint_names) or robot.joint_names
         missing = [name for name in robot.joint_names if name not in self.joint_names]
         if missing:

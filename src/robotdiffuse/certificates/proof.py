@@ -44,7 +44,7 @@ class Tolerances(Settings):
     goal_slack: Number = 1e-5
     """[m] or [rad]"""
     rest: Number = 1e-6
-    """[rad/s]"""
+    """[rad/s] or [m/s]"""
     rate_slack: Number = 0.01
     """Fraction of the robot's limits."""
     chord: Number = 1e-3
@@ -64,8 +64,8 @@ class StretchProof:
     clearance: Values
     """Clearance of the link in the middle of each stretch [m], rounded down."""
     displacement: Values
-    """Upper bound on the distance of any point of the link, anywhere on the stretch, from its place in the
-    middle of the stretch [m], rounded up."""
+    """Upper bound on the clearance that is lost anywhere on the stretch, compared with its middle, as the
+    link and the other body move [m], rounded up."""
     planes: tuple[Plane, ...]
 
 
@@ -99,7 +99,7 @@ class MotionProof:
     robot_parts: dict[str, str]
     """Content hashes of the robot's parts, by name."""
     scene_parts: dict[str, str]
-    """Content hashes of the obstacles, by name."""
+    """Content hashes of the obstacles and of their allowed contacts, by name."""
     motion_hash: str
     """Hash of the motion, without any rounding."""
     tolerances: Tolerances
@@ -110,7 +110,8 @@ class MotionProof:
     """Places between the rows at which the proof has further configurations: times on the cubics between rows
     [s]; for a path, the index of a row plus the fraction of the way to the next row."""
     scene_clearance: float
-    """Lower bound on the distance of all moving links to all obstacles along the whole motion [m]."""
+    """Lower bound on the distance of all moving links to all obstacles that they may not touch, along the
+    whole motion [m]."""
     self_clearance: float
     """Lower bound on the distance between links that are checked against each other, along the whole motion
     [m]."""
@@ -141,7 +142,7 @@ LIMITS = ("lower", "upper", "velocity", "acceleration")
 
 
 def robot_parts(robot: Robot) -> dict[str, str]:
-    """Hashes of everything in a robot that a proof depends on."""
+    """Hashes of everything in a robot that proofs depend on, except torques (`request_parts`)."""
     parts = {
         "planned joints": _hash([robot.base, *robot.joint_names]),
         "allowed collisions": _hash(sorted(sorted(pair) for pair in robot.allowed_collisions)),
@@ -169,7 +170,7 @@ def scene_parts(scene: Scene) -> dict[str, str]:
 
 def request_parts(problem: Problem) -> dict[str, str]:
     """Hashes of moving obstacles with their motions, of path constraints, and of the payload. The payload's
-    hash includes everything that torques depend on: inertias, effort limits and the base's pose."""
+    hash includes the inertias, the effort limits and the base's pose."""
     parts = {}
     if problem.payload is not None:
         robot = problem.robot

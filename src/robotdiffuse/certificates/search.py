@@ -85,8 +85,8 @@ class PlaneFinder:
     def planes(self, stretches: Stretches, needed: Values) -> list[Plane]:
         """Separating planes for stretches.
 
-        needed: for each of the stretches, the clearance that it needs [m]. No plane is made for bodies with
-        balls further apart, or for bodies that touch, which have no separating plane.
+        needed: for each of the stretches, the clearance that it needs [m]. Bodies farther than this from the
+        part's ball get no plane, nor do bodies that touch.
         """
         prover = self.prover
         T = prover.linkage.place(prover.at((stretches.start + stretches.stop) / 2)).T
@@ -119,8 +119,8 @@ class PlaneFinder:
 
 
 def _around(first: _Body, part: Part, surface: Surface, needed: float) -> Iterator[Normal]:
-    """Normals of planes that together separate all elements of a surface from a part by `needed` [m]; the
-    plane for the nearest element is first. Ends early if an element touches the part."""
+    """Normals of planes that together separate all elements of a surface from a part by `needed` [m], those
+    with corners nearest to the part's center first. Ends early if an element touches the part."""
     shown_gaps = np.full(len(surface.corners), -np.inf)
     order = np.argsort(np.sqrt(((surface.corners - part.center) ** 2).sum(axis=-1)).min(axis=1))
     tried_elements = np.zeros(len(order), bool)
@@ -170,8 +170,8 @@ clearance."""
 MAX_SPLIT = 8
 """Largest number of parts into which a stretch is split at once."""
 PLANES_BELOW = 0.02
-"""Planes are tried if the clearance of the spheres is below this, which is about how far spheres stick out of
-meshes [m]."""
+"""Planes are tried if the clearance of the spheres is below this, somewhat more than spheres of moving links
+stick out of meshes [m]."""
 PLANES_DISPLACEMENT = 0.1
 """Largest displacement of stretches for which planes are tried [m]."""
 ROUNDING_RESERVE = 2e-6
@@ -250,7 +250,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     if problem.moving and isinstance(motion, Trajectory):
         times = places_of(motion, between)
         moving, moving_margins = _prove(MovingProver(problem.robot, problem.moving, q, times, off), {"": 0.0})
-        margins[SCENE] = min(margins[SCENE], *moving_margins.values())  # an obstacle may be called "scene"
+        margins[SCENE] = min(margins[SCENE], *moving_margins.values())  # also of an obstacle named "scene"
     record = None
     with suppress(InputError):  # the robot may have been made in this program, and have no file
         record = problem_record(problem)
@@ -325,7 +325,7 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
     plane_finder = None if isinstance(prover, MovingProver) else PlaneFinder(prover)
     proofs = list[StretchProof]()
     total = 0
-    while len(todo.claim) or not proofs:  # robots without bodies have nothing to prove
+    while len(todo.claim) or not proofs:  # once, even without claims
         n = len(todo.claim)
         bounds = prover.bounds(todo, np.zeros(n, bool), [])
         clearance = _down(bounds.clearance)
@@ -362,7 +362,7 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
         proofs.append(StretchProof(prover.claims, todo.some(proved), *columns, kept_planes))
         total += n
         if total > MAX_STRETCHES:
-            raise InputError(f"no proof of less than {MAX_STRETCHES:,} stretches was found for the motion")
+            raise InputError(f"no proof was found for the motion in {MAX_STRETCHES:,} stretches")
         todo = _cut(todo, clearance, displacement, target, ~proved)
     proof = _sorted(joined(prover.claims, proofs))
     margins = proof.clearance - proof.displacement
@@ -374,8 +374,8 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
 
 
 def _check_parts_are_apart(prover: Prover, stretches: Stretches) -> None:
-    """Raise InputError if one of these stretches is for two links that only their exact surfaces show to be
-    free (`Robot.grazing`), so that no separating planes exist."""
+    """Raise InputError if one of these stretches is for grazing links (`Robot.grazing`): their convex parts
+    touch, so that no separating planes exist."""
     for k in stretches.claim.tolist():
         claim = prover.claims[k]
         if frozenset((claim.link, claim.against)) in prover.robot.grazing:

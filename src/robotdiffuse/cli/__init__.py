@@ -1,4 +1,4 @@
-"""The command line. Exit status: 0 solved or done, 1 no plan, 2 bad input, 3 output that could not be
+"""The command line. Exit status: 0 solved or done, 1 no valid motion, 2 bad input, 3 output that could not be
 written, 130 stopped by Ctrl-C."""
 
 import argparse
@@ -55,7 +55,7 @@ def build_parser() -> Parser:
             command.add(commands)
         lines = [f"  {added.dest:<12} {added.help}" for added in commands._choices_actions]
         topics.append("\n".join([f"{topic}:", *lines]))
-        commands._choices_actions.clear()  # or argparse lists all of them without topics
+        commands._choices_actions.clear()  # else argparse lists all of them without topics
     parser.epilog = "\n\n".join(topics)
     return parser
 

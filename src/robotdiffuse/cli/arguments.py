@@ -15,7 +15,7 @@ NO_PLAN = 1
 BAD_INPUT = 2
 WRITE_FAILED = 3
 STOPPED = 130
-ENDINGS = (".html", ".png")
+VIEW_ENDINGS = (".html", ".png")
 """Endings of replays and pictures."""
 ROSBRIDGE_PORT = 9090
 """Default port of rosbridge."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robotdiffuse.cli.arguments import ENDINGS, NO_PLAN, SOLVED, Namespace
+from robotdiffuse.cli.arguments import NO_PLAN, SOLVED, VIEW_ENDINGS, Namespace
 from robotdiffuse.cli.console import Spinner, print_result
 from robotdiffuse.cli.explore import draw_exploration, simulate
 from robotdiffuse.cli.plan import asked_clearance, load_and_plan
@@ -39,7 +39,7 @@ DRAW_TIME_LIMIT = 1.0
 
 def run_demo(arguments: Namespace) -> int:
     names = ("explore.png", "explore.html") if arguments.explore else ("demo.png", "demo.html")
-    outputs = [check_output(file, ENDINGS) for file in names]
+    outputs = [check_output(file, VIEW_ENDINGS) for file in names]
     if arguments.robot is None:
         with resources.as_file(resources.files("robotdiffuse") / "examples" / PROBLEM_FILE) as file:
             problem = load_problem(file)
@@ -49,7 +49,7 @@ def run_demo(arguments: Namespace) -> int:
         return explore_shelf(problem, outputs)
     true_problem = problem
     if arguments.camera:
-        outputs.append(check_output("demo_true.png", ENDINGS))
+        outputs.append(check_output("demo_true.png", VIEW_ENDINGS))
         problem = seen_by_camera(true_problem)
     result = load_and_plan(problem, DEFAULT_PLANNER, picture=True, time_limit=TIME_LIMIT)
     print_result(result, asked_clearance(problem, DEFAULT_PLANNER))

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from robotdiffuse.cli.arguments import ENDINGS, NO_PLAN, SOLVED, Namespace, chosen
+from robotdiffuse.cli.arguments import NO_PLAN, SOLVED, VIEW_ENDINGS, Namespace, chosen
 from robotdiffuse.cli.command import LOOPBACK, PORT
 from robotdiffuse.cli.view import open_in_browser
 from robotdiffuse.core.errors import InputError
@@ -19,13 +19,13 @@ RECORDING = ".mcap"
 
 
 def run_explore(arguments: Namespace) -> int:
-    outputs = [check_output(file, ENDINGS) for file in arguments.out]
+    outputs = [check_output(file, VIEW_ENDINGS) for file in arguments.out]
     if arguments.view:
-        outputs.append(check_output(f"{Path(arguments.problem).stem}.html", ENDINGS))
+        outputs.append(check_output(f"{Path(arguments.problem).stem}.html", VIEW_ENDINGS))
     recording = None
     if arguments.record:
         recording = check_output(arguments.record, (RECORDING,))
-        WRITERS.load(RECORDING)  # its packages are installed
+        WRITERS.load(RECORDING)  # checks for its packages
     settings = ExplorerSettings(**chosen(arguments, ExplorerSettings.__dataclass_fields__))
     if arguments.live:
         if outputs or recording is not None:

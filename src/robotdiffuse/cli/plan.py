@@ -4,7 +4,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from robotdiffuse.cli.arguments import ENDINGS, NO_PLAN, SOLVED, Namespace, chosen
+from robotdiffuse.cli.arguments import NO_PLAN, SOLVED, VIEW_ENDINGS, Namespace, chosen
 from robotdiffuse.cli.compile_ahead import compiling_ahead
 from robotdiffuse.cli.console import Spinner, print_next_view, print_result
 from robotdiffuse.core.errors import InputError
@@ -18,7 +18,7 @@ from robotdiffuse.planning.context import PlanRequest, requested_clearance
 from robotdiffuse.problems.files import load_problem
 from robotdiffuse.problems.problem import Problem, check_unknown
 
-RESULT_ENDINGS = (".json", ".csv", *ENDINGS, *WRITERS)
+RESULT_ENDINGS = (".json", ".csv", *VIEW_ENDINGS, *WRITERS)
 
 
 def run_plan(arguments: Namespace) -> int:
@@ -62,7 +62,7 @@ def _outputs(arguments: Namespace) -> list[Path]:
         for file in arguments.out
     ]
     if arguments.view:
-        files.append(check_output(f"{Path(problem).stem}.html", ENDINGS))
+        files.append(check_output(f"{Path(problem).stem}.html", VIEW_ENDINGS))
     return files
 
 
@@ -85,7 +85,7 @@ def _write(problem: Problem, result: PlanResult, file: Path) -> bool:
     ending = file.suffix.lower()
     if ending == ".json":
         result.save(file)
-    elif ending in ENDINGS:
+    elif ending in VIEW_ENDINGS:
         from robotdiffuse.cli.view import draw
 
         draw(problem, result, file)

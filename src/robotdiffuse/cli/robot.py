@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from robotdiffuse.robots.fitting.preparation import AddReport
 
 MAX_PAIRS = 8
-"""Largest number of pairs of links in the report of `robot add`."""
+"""Largest number of pairs of links whose false collisions `robot add` prints."""
 
 
 def run_list(arguments: Namespace) -> None:
@@ -56,7 +56,7 @@ def run_add(arguments: Namespace) -> None:
     with exit_on_interrupt(bar.stop), bar:
         from robotdiffuse.robots.fitting.preparation import add_robot
 
-        task = bar.add_task("reading the URDF")
+        task = bar.add_task("reading the robot")
 
         def progress(what: str, step: int, steps: int) -> None:
             if console.is_terminal:
@@ -124,8 +124,8 @@ def print_preparation(report: "AddReport") -> None:
 
 
 def _print_pairs(report: "AddReport") -> None:
-    """Print the number of pairs of links that are checked, and of those allowed for each reason, and where
-    they differ from the SRDF."""
+    """Print how many pairs of links are checked, how many are allowed for each reason, and where this differs
+    from the SRDF."""
     reasons = Counter(pair.reason for pair in report.pairs)
     counted = ", ".join(f"{reason} {count}" for reason, count in sorted(reasons.items()))
     show(Table.pairs("", [("pairs of links", counted)]))

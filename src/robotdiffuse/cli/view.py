@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robotdiffuse.cli.arguments import ENDINGS, NO_PLAN, SOLVED, Namespace
+from robotdiffuse.cli.arguments import NO_PLAN, SOLVED, VIEW_ENDINGS, Namespace
 from robotdiffuse.cli.verify import read_result, read_solved
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.input_files import read_json
@@ -85,7 +85,7 @@ def _read(file: str) -> tuple[PlanResult | None, Problem]:
 
 def run_view(arguments: Namespace) -> None:
     files = arguments.out or [f"{Path(arguments.results[0]).stem}.html"]
-    outputs = [check_output(file, ENDINGS) for file in files]
+    outputs = [check_output(file, VIEW_ENDINGS) for file in files]
     if len(arguments.results) == 1:
         result, problem = _read(arguments.results[0])
         write = partial(draw, problem, result)
@@ -119,7 +119,7 @@ def _read_several(files: list[str]) -> tuple[Problem, dict[str, PlanResult]]:
 def run_simulate(arguments: Namespace) -> int:
     from robotdiffuse.simulation import replay
 
-    outputs = [check_output(file, ENDINGS) for file in arguments.out]
+    outputs = [check_output(file, VIEW_ENDINGS) for file in arguments.out]
     result, problem = read_solved(arguments.result)
     if result.trajectory is None:
         raise InputError(f"{arguments.result} holds a path without times; a replay needs a trajectory")

@@ -38,7 +38,7 @@ BOX_SLACK = 1e-6
 rounding errors."""
 
 EMPTY_BOX = np.repeat([[1e18, -1e18]], 3, axis=1)
-"""Lower and upper corner of a box that is far from everything [m]."""
+"""Corners [m] of an empty box: the lower corner is above the upper one."""
 
 
 class RobotArrays(NamedTuple):
@@ -78,7 +78,7 @@ class SceneArrays(NamedTuple):
     """Obstacles: solids, and points in a grid."""
 
     solids: ndarray
-    """[n, 17] Minkowski sums of a box, a disc about its z axis and a ball: center, world-to-shape rotation
+    """[n, 17] Minkowski sums of a box, a disc about its z axis and a ball: center, base-to-shape rotation
     (row-major), half edges, radius of the ball, and 1 for a cylinder, else 0. The first two half edges of a
     cylinder are its radius. Point clouds and meshes that links may touch are covered by balls, which are
     solids here."""

@@ -86,7 +86,7 @@ def is_writable(folder: Path) -> bool:
 
 
 class _Locator(caching._SourceFileBackedLocatorMixin, caching._CacheLocator):
-    """The folder for the compiled code of one module, as Numba asks for it. Its name contains a digest of the
+    """Tells Numba the folder for the compiled code of one module. The folder's name contains a digest of the
     modules from which the code is compiled, so that only installations with the same modules share it."""
 
     def __init__(self, function: Callable, file: str) -> None:
@@ -111,8 +111,8 @@ def _folder_name(module: str) -> str:
 
 
 def _compiled_from(module: str) -> set[str]:
-    """The modules with code or constants that are compiled into a module: the module, the modules of the
-    package that it imports, and so on through those of them that import `core.kernels`."""
+    """The modules with code or constants that are compiled into a module: itself, its imports in the package,
+    the imports of each of these that imports `core.kernels`, and so on."""
     modules: set[str] = set()
     waiting = [module]
     while waiting:
@@ -177,7 +177,7 @@ class _CacheFile(caching.IndexDataCacheFile):
 
     def _load_index(self) -> dict:
         """The index; an empty one if a module that it names has changed, since the module's classes may have
-        other fields now, or be gone."""
+        other fields now."""
         index = Path(self._index_path)
         self._source_stamp = _named_in(index.read_bytes()) if index.is_file() else ""
         return super()._load_index()
@@ -246,8 +246,8 @@ def inner_kernel(**options: Any) -> Callable[[Callable], Any]:
     """A decorator that compiles a function that only compiled code calls.
 
     The wrapper by which Python would call the function is left out: for robots and scenes, which are tuples
-    of many arrays, the wrapper takes a quarter of the compile time. Numba compiles a called function by
-    itself, and again as a part of each caller; with a single caller, `inline="always"` saves the first.
+    of many arrays, the wrapper takes a quarter of the compile time. Numba compiles a called function
+    alone, and again in each caller; with a single caller, `inline="always"` saves compiling it alone.
     """
 
     def compiled(function: Callable) -> Any:

@@ -73,7 +73,7 @@ def read_triangles(
         raise InputError(f"mesh file {file} is empty")
     if content.startswith(LFS_POINTER):
         raise InputError(f"mesh file {file} is a pointer of Git LFS; get the file itself: git lfs pull")
-    import trimesh  # takes seconds, which a file that cannot be read need not cost
+    import trimesh  # takes seconds; files refused above are refused at once
 
     options: dict[str, Any] = {}
     up = "Z_UP"
@@ -111,13 +111,15 @@ def check_ply(content: bytes) -> None:
         stated = sum(map(int, re.findall(rb"^element \S+ (\S+)", header, re.MULTILINE)))
         rows = sum(map(bool, map(bytes.strip, io.BytesIO(body))))
         if rows != stated:
-            raise InputError(f"it holds {rows} of its {stated} vertices, faces and other elements")
+            raise InputError(
+                f"its header states {stated} vertices, faces and other elements, but it holds {rows}"
+            )
 
 
 def _collada(content: bytes) -> tuple[bytes, str, float]:
     """A Collada file without materials and images, its up axis, and its unit [m].
 
-    Raises InputError if its scene uses geometries so often that it would not fit into memory.
+    Raises InputError for unknown up axes and units, and for a scene that would not fit into memory.
     """
     root = parse_xml(content, "it")
     for element in root.iter():
@@ -137,32 +139,32 @@ def _collada(content: bytes) -> tuple[bytes, str, float]:
     if not 1e-9 < meters < 1e9:
         raise InputError(f"its unit is {shown(unit_text)} m; it must be a positive number")
     if any(sum(map(int, (count.text or "").split())) > len(content) for count in root.iter("vcount")):
-        raise InputError("a polygon has more corners than the file has bytes")
-    weights = {
+        raise InputError("a list of polygons has more corners than the file has bytes")
+    sizes = {
         f"#{geometry.get('id')}": sum(len(part.text or "") + BYTES_PER_USE for part in geometry.iter("p"))
         for geometry in root.iter("geometry")
     }
     nodes = {f"#{node.get('id')}": node for node in root.iter("node")}
-    if sum(_weight(scene, nodes, weights, {}, 0) for scene in root.iter("visual_scene")) > MAX_FILE_SIZE:
+    if sum(_size(scene, nodes, sizes, {}, 0) for scene in root.iter("visual_scene")) > MAX_FILE_SIZE:
         raise InputError("its scene uses geometries too often to fit into memory")
     root.set("xmlns", "http://www.collada.org/2005/11/COLLADASchema")
     return ET.tostring(root), up, meters
 
 
-def _weight(
+def _size(
     node: ET.Element,
     nodes: Mapping[str, ET.Element],
-    weights: Mapping[str, int],
+    sizes: Mapping[str, int],
     known: dict[str, int | None],
     depth: int,
 ) -> int:
     """Estimated memory [bytes] of the geometries that a Collada node and its descendants use: the sum of
-    `weights`, with each use of a geometry counted.
+    `sizes`, with each use of a geometry counted.
 
     Args:
         node: The node.
         nodes: All nodes of the file by URL, such as "#arm".
-        weights: Memory of one use of each geometry, by URL [bytes].
+        sizes: Memory of one use of each geometry, by URL [bytes].
         known: Results by URL of a node; None while the result is being computed.
         depth: Nesting of the node below the scene.
     """
@@ -172,13 +174,13 @@ def _weight(
     for child in node:
         url = child.get("url", "")
         if child.tag == "node":
-            total += _weight(child, nodes, weights, known, depth + 1)
+            total += _size(child, nodes, sizes, known, depth + 1)
         elif child.tag == "instance_geometry":
-            total += weights.get(url, 0)
+            total += sizes.get(url, 0)
         elif child.tag == "instance_node" and url in nodes:
             if url not in known:
                 known[url] = None
-                known[url] = _weight(nodes[url], nodes, weights, known, depth + 1)
+                known[url] = _size(nodes[url], nodes, sizes, known, depth + 1)
             weight = known[url]
             if weight is None:
                 raise InputError(f"its node {shown(url)} contains itself")

@@ -92,11 +92,11 @@ class Table:
         places: set[tuple[int, int]] = set()
         for j, column in enumerate(self.columns):
             values = {i: _value(row[j]) for i, row in enumerate(self.rows)}
-            finite = {i: value for i, value in values.items() if value == value}
-            if column.better and finite:
-                best = (max if column.better == "more" else min)(finite.values())
-                texts = {_text(self.rows[i][j], column) for i, value in finite.items() if value == best}
-                winners = [i for i in finite if _text(self.rows[i][j], column) in texts]
+            known = {i: value for i, value in values.items() if value == value}
+            if column.better and known:
+                best = (max if column.better == "more" else min)(known.values())
+                texts = {_text(self.rows[i][j], column) for i, value in known.items() if value == best}
+                winners = [i for i in known if _text(self.rows[i][j], column) in texts]
                 places |= {(i, j) for i in winners if 2 * len(winners) <= len(self.rows)}
         return places
 
@@ -161,8 +161,8 @@ def show(*tables: Table, width: int | None = None) -> None:
 
 
 def pair_lines(table: Table, width: int) -> list[str]:
-    """Lines of a table of pairs with its title; texts are wrapped to `width` characters, if it is not too
-    small."""
+    """Lines of a table of pairs with its title. Rows fit into `width` characters, but texts get at least
+    MIN_TEXT_WIDTH."""
     margin = max((len(name) for name, _ in table.texts), default=0) + 2
     lines = [table.title] if table.title else []
     for name, text in table.texts:

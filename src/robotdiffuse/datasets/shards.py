@@ -42,7 +42,7 @@ class Manifest(Settings):
     """Robot, scenes, settings and versions of a data set."""
 
     robot: str
-    """Name of a bundled robot, or the path of a URDF."""
+    """Name or file of the robot, as `load_robot` takes it."""
     robot_fingerprint: str
     joint_names: tuple[str, ...]
     lower: tuple[float, ...]
@@ -57,7 +57,7 @@ class Manifest(Settings):
     """By family, `center` and `size` of the box on which its scenes stand [m]; None for a family without a
     floor."""
     slots: Natural
-    """Largest number of obstacles in a scene."""
+    """Largest number of obstacles in a scene, without the floor."""
     goals: Count
     """Largest number of goal configurations of a problem."""
     trajectories: Natural
@@ -78,7 +78,7 @@ class Manifest(Settings):
         if self.timing not in ("arc", "time"):
             raise InputError(f"timing is {self.timing!r}; it must be arc or time")
         if self.floors.keys() != self.families.keys():
-            raise InputError(f"floors are of {[*self.floors]}; they must be of {[*self.families]}")
+            raise InputError(f"floors names {[*self.floors]}, but families {[*self.families]}")
         for i in range(len(self.families)):
             self.floor(i)
 
@@ -179,7 +179,7 @@ ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
 """Type and row shape of each array; names in shapes are fields of the manifest. `times` exists only if
 `timing` is "time".
 
-Joint values are in [rad], times in [s], lengths in [m].
+Joint values are in [rad] or, for prismatic joints, [m]; times in [s], lengths in [m].
 
 - `trajectories` begin exactly at `start` and end exactly at `goals[goal_index]`.
 - `goals`, `goal_costs`: unused rows are NaN; the cost of a goal that was not reached is inf.

@@ -35,8 +35,7 @@ QUANTITIES = {
 SPREAD = {"least": 0.0, "5 %": 0.05, "median": 0.5, "95 %": 0.95, "most": 1.0}
 """Quantiles of each quantity over the motions."""
 SAMPLED_MOTIONS = 20_000
-"""Approximate number of motions, spread evenly over the data set, for plots of larger arrays
-(ARRAYS_OF_SAMPLE)."""
+"""Least number of motions, spread evenly over a larger data set, of which ARRAYS_OF_SAMPLE are read."""
 SAMPLED_WAYPOINTS = 24
 """Number of waypoints that are read of each of these motions, spread evenly."""
 ARRAYS_OF_ALL = ("cost", "clearance", "end_clearance", "safety_distance", "line_free", "detour", "family")
@@ -60,8 +59,8 @@ CLEARANCES = {
     "2 to 5": (0.02, 0.05),
     "over 5": (0.05, np.inf),
 }
-"""Classes of motions by detour (path length over straight-line length; "trivial" if the straight line is
-free), and by clearance [m]: lower bound, and exclusive upper bound."""
+"""Classes of motions by detour (path length over straight-line length; 0 if the straight line is free), and
+by clearance [m]: lower bound, and exclusive upper bound."""
 SAFETY_TOLERANCE = 0.002
 """A motion may come closer to obstacles than the safety distance by this much [m], since straight lines
 between waypoints cut corners."""
@@ -214,8 +213,8 @@ def write_page(folder: str | FilePath, file: str | FilePath, robot: Robot | None
     """Write tables and plots of a data set to an .html file, and return the statistics.
 
     `robot` is the robot of the data; None: the robot with the name in the manifest. Raises InputError if
-    matplotlib is not installed, for a file that cannot be written, and in the cases in which `read_figures`
-    raises it.
+    matplotlib is not installed, for a file that cannot be written, for another robot than that of the data,
+    and as `read_figures` does.
     """
     read_manifest(folder)
     target = check_output(file, (".html", ".htm"))
@@ -262,7 +261,7 @@ def _motions(data: DataFigures) -> Histograms:
     panels: Histograms = {}
     for name, column in QUANTITIES.items():
         low = float(name == "detour")
-        chosen = ~(low * data.all["line_free"]).astype(bool)
+        chosen = ~(data.all["line_free"] & (name == "detour"))
         values = column.scale * data.all[name]
         high = max(np.quantile(values[chosen], LAST_QUANTILE) if chosen.any() else 0.0, low + 1e-3)
         parts = {family: values[rows & chosen] for family, rows in data.families.items()}

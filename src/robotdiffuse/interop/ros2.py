@@ -1,8 +1,8 @@
 """ROS 2 without ROS: messages, MCAP files and bags (folders with metadata.yaml and a database); ROS 1 bags.
 
 In MCAP files, three kinds of topics hold Foxglove messages: /scene has the obstacles, and the arm as
-triangles that are fixed to its links; /tf has the poses of links and of moving obstacles; /points/NAME has a
-point cloud. /joint_trajectory, /display_planned_path, /joint_states and /robot_description hold ROS 2
+triangles that are fixed to its links; /tf has the poses of the base, links and moving obstacles; /points/NAME
+has a point cloud. /joint_trajectory, /display_planned_path, /joint_states and /robot_description hold ROS 2
 messages. /robot_description is the URDF, if the robot was read from one. The URDF and the problem are also
 attached as files.
 """
@@ -143,7 +143,7 @@ def joint_state(robot: Robot, q: Configuration, at: int) -> dict[str, Any]:
 
 
 def display_trajectory(problem: Problem, trajectory: Trajectory, record: Mapping[str, Any]) -> dict[str, Any]:
-    """A DisplayTrajectory in plain data: a JointTrajectory, and the state in which the arm starts."""
+    """A DisplayTrajectory in plain data: the JointTrajectory `record`, and the arm's start state."""
     robot = problem.robot
     return {
         "model_id": robot.name,
@@ -162,7 +162,7 @@ def choose_topic(topics: Mapping[str, str], requested: str | None, where: str) -
 
     It is `requested` if that is given. Otherwise, the types JointTrajectory, RobotTrajectory,
     DisplayTrajectory and JointState are tried in this order, and the first one that occurs must have a single
-    topic. Raises InputError if no topic has one of these types, or if several have the first one.
+    topic. Raises InputError if `requested` or no topic has one of these types, or if several have the first.
     """
     kinds = (JOINT_TRAJECTORY, ROBOT_TRAJECTORY, DISPLAY_TRAJECTORY, JOINT_STATE)
     listed = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"
@@ -354,8 +354,8 @@ def _scene(robot: Robot, obstacles: Sequence[Drawable]) -> SceneUpdate:
 
 
 def _add_triangles(entity: Any, surface: Surface, color: Color, opacity: float) -> None:
-    """Add a surface in the frame of an entity. To save space, vertices are in single precision, and equal
-    ones are written once."""
+    """Add a surface in the frame of an entity. To save space, vertices that are equal in single precision are
+    written once."""
     points, number = np.unique(surface.vertices.astype(np.float32), axis=0, return_inverse=True)
     triangles = entity.triangles.add()
     triangles.pose.orientation.w = 1.0
@@ -436,7 +436,7 @@ def checked_reader(stream: io.BufferedReader, where: str) -> McapReader:
     return reader
 
 
-def _typestore(schema: Any) -> Any:
+def _types_of(schema: Any) -> Any:
     """A store with the message types of a topic, as the file defines them."""
     if schema.encoding != "ros2msg":
         return typestore()
@@ -469,7 +469,7 @@ def write_bag(problem: Problem, trajectory: Trajectory, file: Path) -> None:
         "/display_planned_path": (DISPLAY_TRAJECTORY, display_trajectory(problem, trajectory, record)),
     }
     try:
-        # the writer names the database after the folder
+        # the writer names the database after `new`, which is named as `file`
         with replaced_folder(file) as new, BagWriter(new, version=VERSION) as writer:
             for topic, (kind, content) in topics.items():
                 connection = writer.add_connection(topic, kind, typestore=typestore())
@@ -577,7 +577,7 @@ def opened_recording(file: Path, largest: int = MAX_FILE_SIZE) -> Iterator[Recor
         kinds = {topic: schema.name for topic, schema in schemas.items()}
 
         def of_file(topics: Sequence[str]) -> Iterator[Record]:
-            stores = {topic: _typestore(schemas[topic]) for topic in topics}
+            stores = {topic: _types_of(schemas[topic]) for topic in topics}
             for _, channel, message in reader.iter_messages(topics=topics):
                 read = partial(stores[channel.topic].deserialize_cdr, typename=kinds[channel.topic])
                 yield channel.topic, message.log_time, message.data, read

@@ -112,8 +112,8 @@ class CameraPlaces(Settings, name="cameras"):
     """Share of the cameras that stand opposite to the obstacles, as seen from the base. All other cameras may
     be in any direction from the base."""
     front: float = 2.0
-    """Largest angle, at the base, between the direction of a camera that `front_share` counts and the
-    direction exactly opposite to the obstacles."""
+    """Largest angle, at the base, of these `front_share` cameras from the direction exactly opposite to the
+    obstacles."""
     target_spread: float = 0.2
     """Standard deviation, along each axis, of the point that a camera looks at. The mean of this point is
     0.3 m high, halfway between the base and the middle of the obstacles."""

@@ -2,8 +2,8 @@
 
 A. Qureshi, Y. Miao, A. Simeonov and M. Yip, "Motion Planning Networks: Bridging the Gap Between
 Learning-based and Classical Motion Planners", T-RO 2020. Enet is a contractive auto-encoder of the obstacles'
-point cloud. Pnet is a perceptron from (z, a configuration, the goal) to the next waypoint, learned from the
-waypoints of planned paths in both directions. Pnet's dropout stays on in planning, which makes MPNet's paths
+point cloud; its code is z. Pnet is a perceptron from (z, a configuration, the goal) to the next waypoint,
+learned from planned paths in both directions. Pnet's dropout stays on in planning, which makes MPNet's paths
 random. The planner that uses these networks is `baselines.mpnet`.
 
 Differences from the paper:
@@ -22,7 +22,7 @@ Differences from the paper:
   dropout disturbs only the step, not the arm's current configuration.
 - Dropout drops a quarter of the outputs of Pnet's hidden layers, not half, so that these narrower layers keep
   about as many outputs as in the paper. With half dropped, Pnet learns far less in this shorter training.
-- A training sample is a random row of one of our demonstrations and the row 0.7 rad further along the path
+- A training sample is a random waypoint of a trajectory of the data and the one about 0.7 rad further on
   (the paper: neighboring vertices of optimized RRT* paths). On average, 0.7 rad is a sixth of a path, and the
   straight steps are 0.3 % shorter than the path. The step has the same length everywhere but at
   the goal; if it were a fraction of the path's length, the same inputs could have different targets.
@@ -206,8 +206,8 @@ class MPNetNetwork(BaselineNetwork):
     def training_samples(
         self, q: Float[ndarray, "scenes waypoints dof"], rng: np.random.Generator
     ) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
-        """Configurations, the waypoints one step after them, and goals [rad]. Each trajectory is used in a
-        random direction."""
+        """Configurations, the waypoints one step after them, and goals [rad]. Each sample takes its
+        trajectory in a random direction."""
         settings = self.settings
         last = q.shape[1] - 1
         spacing = np.linalg.norm(np.diff(q, axis=1), axis=2).mean(1)

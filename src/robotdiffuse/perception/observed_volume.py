@@ -1,5 +1,5 @@
-"""ObservedVolume: which voxels within an arm's reach depth views observed as occupied or free; the other
-voxels are unknown.
+"""ObservedVolume: the voxels around an arm that depth views observed as occupied or as free; all others are
+unknown.
 
 Each voxel is projected into the image; rays are not followed through the voxels.
 """
@@ -28,12 +28,12 @@ FREE = 1  # observed as entirely free
 BEHIND = 2  # behind a surface
 SHADOW = 3  # behind the arm
 OUT = 4  # outside the image
-LOST = 5  # on a ray without a return although something should be in range
+LOST = 5  # on a ray without a return that does not show that nothing is in range
 # Depths of pixels without a return. A depth of -d means that nothing is nearer than d to the camera.
 NO_RETURN = np.float32(0.0)
 EMPTY = np.float32(-1e-6)
-"""Depth of a pixel without a return where nothing seems to be in range, in a view that states no range. The
-pixel shows nothing, but the voxels behind it are HIDDEN, not LOST."""
+"""Depth of a pixel without a return where nothing seems to be in range, in a view that states no range. It
+frees no voxel, but the voxels behind it are HIDDEN, not LOST."""
 MAX_DEPTH = np.float32(1e6)
 """Depth of a pixel without an obstacle in range [m]. Minima over pixels also use it for those without a
 return."""
@@ -120,9 +120,9 @@ def usable_image(
     """The view's filtered image, and the arm's spheres in the camera's frame, inflated by the margin [m], by
     noise and by the error of the camera's pose.
 
-    Pixels where nothing seems to be in range are infinite if the view states its range, otherwise EMPTY. Near
-    a surface in the image, they are -d instead of infinite, where d is the surface's depth; see `open_depth`.
-    If their rays meet the arm, they are -NEAREST.
+    Pixels without a return where nothing seems to be in range are infinite if the view states its range,
+    otherwise EMPTY. Near a surface in the image, they are -d instead of infinite, where d is the surface's
+    depth; see `open_depth`. If their rays meet the arm, they are -NEAREST.
     """
     T = view.T_base_camera
     depth = filtered(view).depth
@@ -223,7 +223,7 @@ def _count_points(depth, arm, intrinsics, T, low, voxel, counts):
     fny = np.float32(ny)
     fnz = np.float32(nz)
     scale = _ONE / voxel
-    # camera position o, ray r and depth d in edges of voxels, from the grid's lower corner
+    # in edges of voxels: o, the camera's position from the grid's lower corner; d, depth
     ox = (T[0, 3] - low[0]) * scale
     oy = (T[1, 3] - low[1]) * scale
     oz = (T[2, 3] - low[2]) * scale
@@ -304,8 +304,8 @@ def carve(depth, intrinsics, T, spheres, low, voxel, errors, state, behind, coun
 
 @kernel(fastmath=FASTMATH)
 def _half_sizes(T, x, y, half, error):
-    """Half the width and height of the rectangle around a cube's image, divided by the focal length and
-    multiplied by the cube's depth [m].
+    """Half the width and height of the rectangle around a cube's image, as lengths at the depth of the cube's
+    center [m].
 
     half: half the edge of the cube [m]. error: by how far the cube may be displaced [m]. x, y: the direction
     (x, y, 1) of its center in the camera's frame.
@@ -350,7 +350,7 @@ def _state_of_block(first, intrinsics, T, low, voxel, errors, size, factor, tabl
     # u ± du, v ± dv: a rectangle of pixels that contains the rectangles of all voxels of the block
     error = errors[0] + errors[1] * far
     du, dv = _half_sizes(T, x, y, middle * voxel, error)
-    # at least 1 / (z - ez), as in `_carve_block`, for each voxel; ez / near allows for its own direction
+    # at least 1 / (z - ez) of `_carve_block` for each voxel; ez / near: its x and y are not the block's
     wider = (_ONE + ez / near) / near
     far = far + error * (_ONE + far / near) + errors[2] * far * far
     u = fx * x + cx
@@ -411,7 +411,7 @@ def _carve_block(
                 if counts[i, j, k] > 0:
                     pixels = fx * fy * (voxel / z) ** 2
                     counts[i, j, k] = max(0, counts[i, j, k] - int(MIN_POINT_FRACTION * pixels))
-                # the depth at the voxel's center; `front` becomes the nearest depth if there is no return
+                # the image at the voxel's center; `front` becomes the nearest depth if it has no return
                 center_depth = raw[row, column]
                 front = center_depth
                 if front > z + ez or front <= _ZERO:
@@ -502,8 +502,8 @@ class ObservedVolume:
     """How far the voxel is behind an observed surface, the minimum over all views [m]; 0 if it is behind
     none, or observed."""
     lost: Bool[ndarray, "56 56 32"]
-    """The voxel is unknown and behind no surface; in some view its ray has no return, although something
-    should be in range."""
+    """The voxel is unknown and behind no surface; in some view its ray has no return, and does not show that
+    nothing is in range."""
 
     @cached_property
     def unknown(self) -> Bool[ndarray, "56 56 32"]:
@@ -511,11 +511,12 @@ class ObservedVolume:
 
 
 def observe(views: Sequence[DepthView], robot: Robot, start: Configuration) -> ObservedVolume:
-    """The volume observed by all views. A voxel is occupied if it is in any view, else free if it is in any.
+    """The volume observed by all views. A voxel is occupied if any view says so, else free if any does.
 
-    A voxel is free in a view if none of the pixels that it may cover is nearer than its far side. start: the
-    arm's configuration in views that state none. Raises InputError if there are no views, or for a
-    configuration of the wrong length.
+    A voxel is free in a view if all pixels that it may cover are in the image and none is nearer than its far
+    side, which must be in range; at most half of these pixels may be without a return. start: the arm's
+    configuration in views that state none. Raises InputError if there are no views, or for a configuration of
+    the wrong length.
     """
     if not len(views):
         raise InputError("views is empty; at least one depth view is needed")
@@ -523,7 +524,7 @@ def observe(views: Sequence[DepthView], robot: Robot, start: Configuration) -> O
 
 
 def merged(volumes: Sequence[ObservedVolume]) -> ObservedVolume:
-    """The union of volumes: a voxel is occupied if it is in any volume, else free if it is in any."""
+    """The union of volumes: a voxel is occupied if any volume says so, else free if any does."""
     occupied, free, shadow, lost = (np.zeros(SHAPE, np.bool_) for _ in range(4))
     out = np.ones(SHAPE, np.bool_)
     depth_behind = np.full(SHAPE, np.inf, np.float32)
@@ -546,7 +547,7 @@ def _observed(view: DepthView, robot: Robot, start: Configuration) -> ObservedVo
     """The volume observed by one view."""
     q = start if view.configuration is None else view.configuration
     if len(q) != robot.dof:
-        raise InputError(f"view.configuration has {len(q)} numbers; {robot.name} plans {robot.dof} joints")
+        raise InputError(f"the configuration has {len(q)} numbers; {robot.name} plans {robot.dof} joints")
     state, behind, counts = carve_view(view, robot, q, COARSE)
     occupied = counts > 0
     behind[(state != BEHIND) | occupied] = 0.0

@@ -46,8 +46,8 @@ ALIKE = 0.8
 FACING = 0.4
 """Smallest cosine of the angle between the arm's normal and the ray."""
 GATES = (1.0, 0.7, 0.5, 0.3, 0.2, 0.2)
-"""One factor for each round. The largest distance of matched points is this factor times their stated errors,
-plus NOISES standard deviations of their noise."""
+"""One factor for each round. Matched points are at most this factor times `_Image.shift`, plus NOISES
+standard deviations of their noise, from the surface."""
 NOISES = 3.0
 POINTS_PER_ERROR = 4
 """Number of points that count as one independent measurement."""
@@ -74,8 +74,8 @@ DEPTHS = np.arange(0.2, 3.0, 0.2)
 NEAR = 0.6
 """Up to this distance, the whole error of a refined pose counts as an error of its position [m]."""
 SAME_CAMERA = 0.1
-"""Largest difference of any entry of a camera's pose from a nominal pose on the arm for it to be this camera:
-[m], or without unit for the rotation."""
+"""A camera is that of a nominal pose on the arm if no entry of its pose differs by more: [m], or without unit
+for the rotation."""
 
 
 class _Match(NamedTuple):
@@ -124,7 +124,7 @@ class _Image:
     """Normals at the points, towards the camera."""
     noise: Values
     """Standard deviations of the points' depths [m]."""
-    stated: Values
+    shift: Values
     """How far the stated error of the pose may displace each point [m]."""
     arm: Bool[ndarray, "n"]
     """Which points are on the arm; they are matched with the arm's surface."""
@@ -201,9 +201,9 @@ class PoseRefinement:
             use[at[:: max(1, -(-len(at) // MAX_POINTS))]] = True
         points = points[use]
         noise = spread * points[:, 2] ** 2
-        stated = pose_error(view, np.linalg.norm(points, axis=1))
+        shift = pose_error(view, np.linalg.norm(points, axis=1))
         surface = arm_surface(self._robot, q) if arm.any() else None
-        return _Image(camera, T, q, shows_scene, points, normals[use], noise, stated, arm[use], surface)
+        return _Image(camera, T, q, shows_scene, points, normals[use], noise, shift, arm[use], surface)
 
     def _fit(self) -> None:
         """Estimate the errors of all poses from all images by Gauss-Newton steps.
@@ -217,7 +217,7 @@ class PoseRefinement:
             hessian = np.diag(prior)
             gradient = prior * unknowns
             for match in self._matches(unknowns, gate):
-                # Geman and McClure's weights, divided by the variance of the weighted distances
+                # Geman and McClure's weights, over the variance of the distances (at least noise ** 2)
                 weights = 1 / (1 + (match.distances / (0.5 * match.limits)) ** 2) ** 2
                 variance = (weights * (match.distances / match.noise) ** 2).sum() / max(weights.sum(), 1e-9)
                 weights /= match.noise**2 * max(variance, 1.0) * POINTS_PER_ERROR
@@ -254,7 +254,7 @@ class PoseRefinement:
             own = slice(6 * image.camera, 6 * image.camera + 6)
             rows[:, own] = np.hstack([m, np.cross(image.points[use], m)])
             noise = np.hypot(image.noise[use], error)
-            return _Match(rows, r, noise, gate * image.stated[use] + NOISES * noise)
+            return _Match(rows, r, noise, gate * image.shift[use] + NOISES * noise)
 
         for i, (image, T) in enumerate(zip(self._images, poses, strict=True)):
             if image.surface is not None:
@@ -313,7 +313,7 @@ def _pose(error: Float[ndarray, "6"]) -> Pose:
 
 def _deviation(view: DepthView, T: Pose, covariance: Float[ndarray, "6 6"]) -> tuple[float, float]:
     """The `pose_deviation` of a refined pose: a position [m] and an angle [rad] that bound how far its error
-    displaces points in the map; at most the stated deviation.
+    displaces points in the map. Their sum is at most that of the stated deviation.
 
     The position bounds displacements along rays, and any displacement of points nearer than NEAR. The angle
     bounds the other displacements, in proportion to the distance.

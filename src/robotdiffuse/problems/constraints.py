@@ -150,9 +150,9 @@ class CartesianLine(FrameConstraint):
     """The origin of a link moves on the straight segment from its start position to its goal position.
 
     The goal must therefore determine the pose of the link. It may be a configuration, several configurations
-    with the link at the same pose, or a pose without tolerances of this link or of a link rigidly connected
-    to it. The orientation follows the shortest rotation from start to goal, in proportion to the fraction of
-    the segment traveled.
+    with the link at the same pose, or poses of links. One of them, without tolerances, must then be of this
+    link or of one rigidly connected to it. The orientation follows the shortest rotation from start to goal,
+    in proportion to the fraction of the segment traveled.
     """
 
     kind: ClassVar[str] = "cartesian_line"
@@ -161,7 +161,7 @@ class CartesianLine(FrameConstraint):
     angle: float | None = 0.05
     """Maximum angle from the interpolated orientation [rad]; None: any orientation."""
     speed: float | None = None
-    """Maximum speed of the link's origin [m/s]; None: only the joint limits limit the speed."""
+    """Maximum speed of the link's origin [m/s]; None: only the limits of the joints limit the speed."""
 
 
 Constraint = AxisCone | PositionBox | OnPlane | OnLine | CartesianLine

@@ -13,8 +13,8 @@ from robotdiffuse.robots.robot import Robot
 UNIT = 5e-5
 """Resolution of stored vertices [m]."""
 MAX_BOX_DIFFERENCE = 0.03
-"""A visual mesh is used only if its bounding box and that of the collision geometry differ by less than this
-[m]."""
+"""A visual mesh of a moving link is used only if its bounding box and that of collision geometry differ by
+less than this [m]."""
 LINK_COLOR = (236, 238, 240)
 # sRGB colors of held objects and of tools
 HELD_COLOR = (0xE3, 0xB2, 0x3C)

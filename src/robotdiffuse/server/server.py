@@ -17,7 +17,7 @@ from robotdiffuse.server.settings import GRACE_TIME, ServeSettings
 from robotdiffuse.server.worker_pool import WorkerPool
 
 KEEP_ALIVE_TIMEOUT = 5
-"""Time that an idle connection stays open [s]."""
+"""Time that a connection stays open after an answer [s]."""
 SIGNALS = signal.SIGINT, signal.SIGTERM
 
 
@@ -68,7 +68,7 @@ async def _serve(
         make_app(pool, robots),
         lifespan="off",
         http=Connection,
-        log_level="error",  # mistakes of clients are not logged
+        log_level="error",  # `Access` and `Connection` log mistakes of clients
         access_log=False,
         server_header=False,
         timeout_keep_alive=KEEP_ALIVE_TIMEOUT,

@@ -58,7 +58,8 @@ class ReplayContact:
     depth: float
     """Largest penetration depth [m]; negative if a gap remained.
 
-    Bullet's meshes repel each other from a distance of 1 mm, so bodies may be pushed apart before they touch.
+    Bullet's meshes repel each other from a distance of 2 mm, other bodies from 1 mm, so bodies may be pushed
+    apart before they touch.
     """
 
 

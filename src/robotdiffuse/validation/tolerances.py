@@ -41,8 +41,8 @@ class VerifySettings(Settings, name="verify"):
     may also differ by this fraction of its limit from the velocity that the positions give, and from zero at
     the start and the end."""
     rate_agreement: NotNegative = 0.5
-    """How far the acceleration of a row may be outside of the range of accelerations of the cubics before and
-    after the row, as a fraction of the joint's greatest acceleration."""
+    """How far a row's acceleration may be outside of the interval between those that the cubics before and
+    after it have there, as a fraction of the joint's greatest acceleration."""
     jump: Positive = 1.5
     """A step between rows is a jump if a joint's mean velocity exceeds its velocity limit by this factor."""
     chord: Positive = 1e-3
@@ -59,16 +59,16 @@ class VerifySettings(Settings, name="verify"):
     reversals: Natural = 3
     """Largest allowed number of sharp reversals; a motion with more of them twitches."""
     tightness: Annotated[float, Bound(above=0.0, below=1.0)] = 0.5
-    """The certified clearances of a `Report` are at least this fraction of the smallest measured
-    clearance."""
+    """The certified clearances of a `Report` are at least this fraction of the smallest measured clearance,
+    before the deviation of a trajectory's cubics is subtracted."""
 
 
 DEFAULT = VerifySettings()
 EXACT = VerifySettings(goal_distance=1e-4, goal_angle=1e-4)
 """Tight tolerances, by which `goal_index` distinguishes goals that are close to each other."""
 BLEND_SAMPLE_SHARE = 0.25
-"""Largest distance between the configurations at which `first_place_within` tests a path, as a fraction of
-the blend radius [joint-space L2]."""
+"""Largest joint-space distance (L2) between configurations at which `first_place_within` tests a path, per
+unit of the blend."""
 
 
 class GoalError(NamedTuple):
@@ -133,7 +133,9 @@ def goal_error(
     else:
         beyond = np.maximum(np.abs(T_goal_end[:3, 3]) - xyz - slack, 0.0)
         at_goal = bool(np.linalg.norm(beyond) <= blend)
-    oriented = angle <= settings.goal_angle if rpy is None else _turned(T_goal_end[:3, :3], rpy, slack)
+    oriented = (
+        angle <= settings.goal_angle if rpy is None else _orientation_within(T_goal_end[:3, :3], rpy, slack)
+    )
     if at_goal and oriented:
         return None
     more = "" if xyz is None and rpy is None else ", which is beyond its tolerances"
@@ -209,7 +211,7 @@ def _near(
     return np.linalg.norm(offsets, axis=1) <= tolerance + blend
 
 
-def _turned(rotation: ndarray, tolerance: ndarray, slack: float) -> bool:
+def _orientation_within(rotation: ndarray, tolerance: ndarray, slack: float) -> bool:
     """Whether roll, pitch and yaw of a rotation are within the tolerances [3]. Each rotation has two triples
     of these angles; one within the tolerances is enough."""
     roll, pitch, yaw = rpy_from_rotation(rotation)

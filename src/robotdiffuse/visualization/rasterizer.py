@@ -70,8 +70,9 @@ def _lit(light, at, n, first):
     """Fraction of directional lights that reach a point `at` with normal n, weighted by the cosine of their
     angles. Only every fourth light from `first` on is used.
 
-    Each light has an orthographic depth map of the surfaces nearest to it. The point is moved along its
-    normal, so that surfaces do not shadow themselves.
+    Each light has an orthographic map of coordinates towards it, plus 100 m so that they are positive: those
+    of the surfaces nearest to it. The point is moved along its normal, so that surfaces do not shadow
+    themselves.
     """
     maps, directions, scale, center = light
     bias = 2 / scale
@@ -217,7 +218,7 @@ def blend_ghost(image, solid, near, seen, camera, toward, tint, alpha):
     ident, _, faces, normals, colors = seen
     for row in range(h):
         for column in range(w):
-            # slightly nearer than the solid surfaces: links of both arms may be at the same place
+            # clearly nearer surfaces only: a ghost's link may be where that of the solid arm is
             if near[row, column] <= 1.003 * solid[row, column]:
                 continue
             _, ray, n, weights, _ = _surface(row, column, near, seen, camera, -np.inf)

@@ -7,8 +7,8 @@ spheres, and from the convex meshes where the spheres are too coarse.
 
 Let q be the middle of a piece and dq half of the joint motion from its start to its end. Each configuration
 of the piece is q + d with |d_j| <= D_j, and there is a t in [-1, 1] with |d_j - t dq_j| <= e_j for all j. On
-a straight line e is zero. The second derivative of a point's position p by joints j <= k is at most the
-distance L_k of the point from the axis of joint k, so
+a straight line e is zero. The second derivative of a point's position p by q_j and q_k, j <= k, is at most
+L_k, the largest distance of the point from the axis of joint k (1 if the joint slides), so
 
     p(q + d) = p(q) + t v + r,   v = J(q) dq,   |r| <= sum_k L_k (e_k + D_k (D_k / 2 + sum_{j<k} D_j)).
 
@@ -82,14 +82,14 @@ class Checks(NamedTuple):
     base."""
     common: np.ndarray
     """[checks] the frame relative to which motion is measured: `base`, or the frame where two arms part."""
-    second: np.ndarray
+    second_arm: np.ndarray
     """[checks] for links on two arms, the first joint of the second arm; else 0."""
     motion_radii: np.ndarray
     """[checks, dof] bound on the motion of any point of the link, or of either link of a pair, per unit of
     joint motion, relative to `common`."""
     surfaces_below: np.ndarray
-    """[checks] for grazing links, distance of the convex parts up to which their mesh surfaces decide [m];
-    Coal computes it. Else 0."""
+    """[checks] for grazing links, distance of the convex parts up to which Coal measures their mesh surfaces
+    [m]; else 0."""
 
 
 class Round(NamedTuple):
@@ -140,12 +140,12 @@ def _spread(motion, start, stop, spread):
 
 
 @inner_kernel(inline="always")
-def _remainder(radii, second, e, max_offset):
+def _remainder(radii, second_arm, e, max_offset):
     """The bound on |r| at the top of this file [m]."""
     total = 0.0
     before = 0.0
     for k in range(len(radii)):
-        if k == second:
+        if k == second_arm:
             before = 0.0
         if radii[k] > 0:
             total += radii[k] * (e[k] + max_offset[k] * (0.5 * max_offset[k] + before))
@@ -173,7 +173,7 @@ def bound_by_spheres(arm, scene, motion, checks, pieces, best, work):
                 _spread(motion, pieces.start[row], pieces.stop[row], spread)
                 for c in range(count):
                     if pieces.undecided[row, c]:
-                        rest[row, c] = _remainder(checks.motion_radii[c], checks.second[c], e, max_offset)
+                        rest[row, c] = _remainder(checks.motion_radii[c], checks.second_arm[c], e, max_offset)
             for j in range(dof):
                 block[j, i] = q[j]
                 moves[j, i] = dq[j]

@@ -6,9 +6,9 @@ them, forwards and backwards, at full or half speed, are timed within the robot'
 of times finds the sequence of motions and waits that reaches the end as early as possible. A place is reached
 at a time if the arm was there one step before and can wait, or if a collision-free motion ends there. This is
 SIPP on a grid (M. Phillips and M. Likhachev, "SIPP: Safe interval path planning for dynamic environments",
-ICRA 2011). The validator then checks the whole motion in continuous time. If it refuses the motion, other
-paths are tried: paths found with other seeds, and paths around the moving obstacles as they stand at a random
-time.
+ICRA 2011). The validator then checks the whole motion in continuous time. If it refuses the motion, or no
+sequence reaches the end, other paths are tried: paths found with other seeds, and paths around the obstacles
+of known motion as they stand at a random time.
 
 With waypoints, the motion stops at each waypoint in their order. It may wait there or go back to an earlier
 waypoint.
@@ -37,52 +37,51 @@ from robotdiffuse.validation.validator import verifier
 UNREACHED = -2
 WAITED = -1
 CELLS_PER_CLOCK_CHECK = 10_000_000
-"""Number of cells (configurations of motions at ticks) that are visited between two readings of the clock."""
+"""Number of configurations of motions that are tested between two readings of the clock."""
 
 
 def earliest(
     clear: Bool[ndarray, "configurations ticks"],
-    cell: Int[ndarray, "places"],
+    row: Int[ndarray, "places"],
     source: Int[ndarray, "motions"],
     target: Int[ndarray, "motions"],
     first: Int[ndarray, "n"],
-    cells: Int[ndarray, "k"],
+    rows: Int[ndarray, "k"],
 ) -> tuple[list[int], bool]:
     """The schedule that takes the arm from the first place, where it rests at tick 0, to the last place as
     early as possible.
 
     clear: whether each configuration is free at each tick.
-    cell: index of the configuration at each place.
+    row: row of `clear` of each place.
     source, target: indices of the places where each motion begins and ends.
-    first, cells: motion m passes the configurations with the indices cells[first[m] : first[m + 1]], one per
-        tick.
+    first, rows: motion m passes the rows rows[first[m] : first[m + 1]] of `clear`, one per tick.
 
     Returns the indices of the motions in order, with -1 for each tick of waiting, and whether the last place
     can be reached. Raises OutOfTimeError if the deadline leaves no time.
     """
-    came = np.full((clear.shape[1], len(cell)), UNREACHED)
+    came = np.full((clear.shape[1], len(row)), UNREACHED)
     came[0, 0] = WAITED
-    count = max(CELLS_PER_CLOCK_CHECK // len(cells), 1)
+    count = max(CELLS_PER_CLOCK_CHECK // len(rows), 1)
     for begin in range(0, len(came) - 1, count):
         check_timing("the grid of times")
-        end = _reached(came, clear, cell, source, target, first, cells, begin, count)
+        end = _reached(came, clear, row, source, target, first, rows, begin, count)
         if end >= 0:
             return _way_to(end, came, source, first), True
     return [], False
 
 
 @kernel(nogil=True)
-def _reached(came, clear, cell, source, target, first, cells, begin, count):
+def _reached(came, clear, row, source, target, first, rows, begin, count):
     """Visit `count` ticks from `begin` on. For each tick and place, write to came [ticks, places] the index
     of the motion by which the place is reached then, or WAITED. Returns the tick at which the last place is
     first reached; -1 if it is not reached in these ticks."""
-    places = len(cell)
+    places = len(row)
     ticks = clear.shape[1]
     for now in range(begin, min(begin + count, ticks - 1)):
         if came[now, places - 1] != UNREACHED:
             return now
         for i in range(places):
-            can_wait = came[now, i] != UNREACHED and clear[cell[i], now + 1]
+            can_wait = came[now, i] != UNREACHED and clear[row[i], now + 1]
             if can_wait and came[now + 1, i] == UNREACHED:
                 came[now + 1, i] = WAITED
         for m in range(len(source)):
@@ -92,8 +91,8 @@ def _reached(came, clear, cell, source, target, first, cells, begin, count):
             # both configurations of each step must be free at both of its ticks
             free = True
             for k in range(first[m + 1] - first[m] - 1):
-                a = cells[first[m] + k]
-                b = cells[first[m] + k + 1]
+                a = rows[first[m] + k]
+                b = rows[first[m] + k + 1]
                 if not (clear[a, now + k + 1] and clear[b, now + k] and clear[b, now + k + 1]):
                     free = False
                     break
@@ -122,7 +121,7 @@ def _way_to(end, came, source, first):
 GRID_STEP = 0.02
 """Step of the grid of times [s]."""
 CELL_SECONDS = 1e-8
-"""Smallest computing time per cell of the grid (a configuration at a time) [s]."""
+"""Smallest computing time of a cell, one configuration at one tick [s]."""
 GRID_TRAVEL = 0.02
 """Largest travel of any point of the arm between two neighboring configurations of the grid [m]."""
 # The grid of times ends at DURATION_FACTOR times the duration of a motion that stops at every place (the mean

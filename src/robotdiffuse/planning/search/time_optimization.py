@@ -21,8 +21,8 @@ from robotdiffuse.trajectories.timing_kernel import estimated_time, evaluate_at,
 
 # An attempt draws a number from 0 to 1. Below REMOVE_SHARE, it removes a waypoint, unless it is the only
 # inner one; below ADD_SHARE, it adds a waypoint in the middle of a segment and moves it; below WIDEN_SHARE,
-# it changes a corner's deviation; otherwise it moves a waypoint, and in half of the cases also changes its
-# deviation.
+# it changes the deviation of a corner (how far its rounding may leave it); otherwise it moves a waypoint, and
+# in half of the cases also changes the deviation of its corner.
 REMOVE_SHARE = 0.02
 ADD_SHARE = 0.05
 WIDEN_SHARE = 0.12
@@ -36,7 +36,8 @@ MOVE_LOG_RANGE = 5.0
 REPEAT_FACTOR = 2.0
 """After a successful move, the waypoint is moved again by this multiple of the move."""
 MIN_DEVIATION = 0.002
-"""Smallest deviation of a corner here [rad]; later timing may round corners less."""
+"""`free_deviations` neither checks nor halves deviations up to this [rad]; later timing may round corners
+less."""
 MIN_SEGMENT = 0.005
 """Shortest segment [rad]."""
 # A rounded corner is checked along chords of this length [rad], of which there are at most MAX_CHORDS.
@@ -55,9 +56,8 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, longest, 
     If a move makes the path faster, the next attempt moves this waypoint further in the same direction.
     """
     scratch = make_scratch(space, space.lower)
-    # a literal 0 would be compiled separately
     step = np.zeros(path.shape[1])
-    moved = np.int64(0)
+    moved = np.int64(0)  # a literal 0 would be compiled separately
     for _ in range(tries):
         new, new_deviations, first, last = _candidate(space, path, deviations, step, moved, state)
         moved = 0
@@ -80,8 +80,8 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, longest, 
 @inner_kernel(inline="always")
 def _candidate(space, path, deviations, step, again, state):
     """A changed path, its deviations, and the indices of the first and the last changed segment. The path has
-    no waypoints if a changed segment is too short. again: index of a waypoint that moves again in the
-    direction `step`; 0: a random change."""
+    no waypoints if one of these is too short and no waypoint was removed. again: index of a waypoint that
+    moves again in the direction `step`; 0: a random change."""
     n, dof = path.shape
     kind = np.float32(1.0) if again else random(state)
     i = again if again else 1 + min(int(random(state) * (n - 2)), n - 3)
@@ -149,8 +149,8 @@ def _corner_is_free(space, line, corner, scratch):
 
 @kernel(nogil=True)
 def free_deviations(space, path, deviation):
-    """For each corner of a free polyline [n, dof], `deviation`, halved until the rounded corner is free or
-    the deviation is at most MIN_DEVIATION [n - 2]."""
+    """Deviations [n - 2] of the corners of a free polyline [n, dof]: each is `deviation`, halved until the
+    rounded corner is free or the deviation is at most MIN_DEVIATION."""
     scratch = make_scratch(space, space.lower)
     out = np.full(len(path) - 2, deviation)
     for i in range(len(out)):
@@ -182,8 +182,8 @@ def still_improves(
     """Whether more work is likely to reduce a cost further: the last doubling of the work reduced it by at
     least the fraction `gain`, or less work than `patience` was done.
 
-    history: the work done and the cost, each time that the cost fell. work: the work done so far. now: the
-    cost.
+    history: the work done and the cost, each time that the cost fell. work, now: the present
+    work and cost.
     """
     half = [cost for after, cost in history if after <= work / 2]
     if work < patience or not half:
