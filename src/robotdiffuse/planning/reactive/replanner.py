@@ -182,7 +182,7 @@ class ReplannerSettings(Settings, name="replanner"):
     jerk: Jerk | None = None
     """Jerk limit of every joint [rad/s³] or [m/s³]; None: each joint's own limit, and no limit for a joint
     without one. The default of `rd.plan` for such joints, 10 / s times the acceleration limit, would make
-    stops 1.7 times as long."""
+    stops much longer."""
 
 
 @dataclass(frozen=True, eq=False)
