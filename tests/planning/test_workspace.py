@@ -260,7 +260,7 @@ def test_motions_are_joined_with_and_without_a_stop() -> None:
     assert rd.join([there, line], time_limit=10.0).solved
     space.remove("can")
     elsewhere = space.plan("ready", end, time_limit=10.0)
-    refuses("constraints that others lack", rd.join, [there, line], 0.05)
+    refuses("constraints .or lines. of their own", rd.join, [there, line], 0.05)
     refuses(r"results\[1\] begins .* rad from the end of results\[0\] in", rd.join, [there, there], 0.0)
     refuses("it takes two to join", rd.join, [there], 0.0)
     refuses(r"results\[1\] is for another robot or scene", rd.join, [there, elsewhere], 0.0)

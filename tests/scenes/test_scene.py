@@ -49,7 +49,7 @@ def test_an_allowed_contact_is_allowed_everywhere(kind: str) -> None:
     rows = result.trajectory.positions[::8]
     assert not ExactCollision(problem.robot, problem.scene).collides(rows).any()
     with oracle.PyBulletOracle(problem.robot, problem.scene) as bullet:
-        assert bullet.check_frames(rows) is None
+        assert bullet.check_rows(rows) is None
         nearest = bullet.nearest(HOME)
         assert nearest is None or nearest.distance > 0
     assert not rd.certify(problem, result.trajectory).check(problem).differences

@@ -75,7 +75,7 @@ def test_contact_is_reported_where_the_motion_runs_into_an_obstacle() -> None:
     trajectory = motion(robot, np.zeros(3), np.array([1.2, 0.0, 0.0]))
     run = replay(robot, scene, trajectory)
     with PyBulletOracle(robot, scene) as oracle:
-        first = oracle.check_frames(run.reference, tolerance=0.0)
+        first = oracle.check_rows(run.reference, tolerance=0.0)
     assert first is not None and not run.free
     contact = run.contacts[0]
     assert (contact.link, contact.other) == ("l3", "sphere")
@@ -266,7 +266,7 @@ def test_a_single_waypoint_is_checked() -> None:
     robot = box_arm()
     with PyBulletOracle(robot, rd.Scene([rd.Sphere((1.2, 0, 0), 0.1)])) as oracle:
         found = oracle.check_path(rd.Path(robot.joint_names, np.zeros((1, 3))))
-        refuses(r"tolerance is -0\.1; it must not be negative", oracle.check_frames, np.zeros((1, 3)), -0.1)
+        refuses(r"tolerance is -0\.1; it must not be negative", oracle.check_rows, np.zeros((1, 3)), -0.1)
     assert found is not None and (found.link, found.other, found.at) == ("l3", "sphere", 0.0)
     assert found.distance == pytest.approx(-0.1, abs=0.001)
 
@@ -277,7 +277,7 @@ def test_scenes_are_replaced_and_the_robot_stays() -> None:
     with PyBulletOracle(box_arm(), rd.Scene([rd.Box((0, 1, 0), (1, 0.1, 1))])) as oracle:
         for shapes, hit in ([ball], "sphere"), ([], None), ([ball], "sphere"), (clouds, "point_cloud_2"):
             oracle.set_scene(rd.Scene(shapes))
-            found = oracle.check_frames(np.zeros((1, 3)))
+            found = oracle.check_rows(np.zeros((1, 3)))
             assert (found and found.other) == hit
 
 
@@ -285,7 +285,7 @@ def test_obstacles_at_links_that_do_not_move_are_nothing() -> None:
     robot = far_pairs_only(example_robot("panda"))
     q = np.array([[0, -0.785, 0, -2.356, 0, 1.571, 0.785]])
     with PyBulletOracle(robot, rd.Scene([rd.Box((0, 0, -0.05), (2, 2, 0.12), name="floor")])) as oracle:
-        assert oracle.check_frames(q) is None and oracle.nearest(q[0], 0.0) is None
+        assert oracle.check_rows(q) is None and oracle.nearest(q[0], 0.0) is None
 
 
 def test_point_clouds_agree_with_coal() -> None:
@@ -302,7 +302,7 @@ def test_point_clouds_agree_with_coal() -> None:
             if right > 0:
                 assert oracle.distance(row) == pytest.approx(right, abs=TOLERANCE)
             if abs(right) > TOLERANCE:
-                assert (oracle.check_frames(row[None], 0.0) is not None) == (right < 0)
+                assert (oracle.check_rows(row[None], 0.0) is not None) == (right < 0)
 
 
 def test_a_mesh_that_comes_again_takes_no_memory_again() -> None:

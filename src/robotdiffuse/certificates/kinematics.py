@@ -159,10 +159,10 @@ class Linkage:
         steps: configurations minus that of the posture; the joints move anywhere on the straight lines
         between these configurations, or within `off` of the lines.
 
-        To first order, a point's movement along a normal is linear in the joints, so its minimum is at one of
-        the steps, less what `off` adds. With spans D and the greatest distance L_k of the point from axis k,
-        the remainder is at most sum_k L_k D_k (D_k / 2 + sum_{j<k} D_j), because the second derivative of the
-        point by joints j <= k is at most L_k.
+        To first order, a point's movement along a normal is linear in the joints, so it is least at one of
+        the steps; `off` lowers it further. With spans D and the greatest distance L_k of the point from axis
+        k, the remainder is at most sum_k L_k D_k (D_k / 2 + sum_{j<k} D_j), because the second derivative of
+        the point by joints j <= k is at most L_k.
         """
         moving_joints = moved_by.tolist()
         spans = np.abs(steps).max(axis=0) + off
@@ -240,7 +240,7 @@ class Cubics(NamedTuple):
     @property
     def turning_points(self) -> Configurations:
         """Positions that include the extremes of each joint inside each cubic: two rows per cubic, at the
-        roots of the velocity, or at an end of the cubic where there is no root inside."""
+        roots of the velocity, or elsewhere on the cubic where there is no root inside."""
         v = self.velocities / self.steps
         curve = self.end - self.start
         root = np.sqrt(np.maximum(self.start**2 - 2 * curve * v, 0.0))

@@ -119,8 +119,8 @@ class PlaneFinder:
 
 
 def _around(first: _Body, part: Part, surface: Surface, needed: float) -> Iterator[Normal]:
-    """Normals of planes that together separate all elements of a surface from a part by `needed` [m], those
-    with corners nearest to the part's center first. Ends early if an element touches the part."""
+    """Normals of planes that separate the elements of a surface from a part, by `needed` [m] where possible;
+    elements with corners nearest to the part's center come first. Ends early if one touches the part."""
     shown_gaps = np.full(len(surface.corners), -np.inf)
     order = np.argsort(np.sqrt(((surface.corners - part.center) ** 2).sum(axis=-1)).min(axis=1))
     tried_elements = np.zeros(len(order), bool)
@@ -170,16 +170,16 @@ clearance."""
 MAX_SPLIT = 8
 """Largest number of parts into which a stretch is split at once."""
 PLANES_BELOW = 0.02
-"""Planes are tried if the clearance of the spheres is below this, somewhat more than spheres of moving links
-stick out of meshes [m]."""
+"""Planes are tried if the clearance of the spheres is below this [m]. The spheres of moving links stick out
+of the meshes by somewhat less."""
 PLANES_DISPLACEMENT = 0.1
 """Largest displacement of stretches for which planes are tried [m]."""
 ROUNDING_RESERVE = 2e-6
 """Margin added to each target clearance, so that rounded bounds still prove the clearance [m]."""
 MAX_STRETCHES = 200_000
-"""Largest number of stretches that are tried, and of places in a proof."""
+"""Largest number of stretches that are tried, and of configurations between the rows of a motion."""
 PLACE_DECIMALS = 7
-"""Number of decimals of places: the ends of stretches."""
+"""Number of decimals of the ends of stretches."""
 MAX_HALVINGS = 20
 """Largest number of times that the step between two rows is halved to prove path constraints or torques."""
 
@@ -250,7 +250,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     if problem.moving and isinstance(motion, Trajectory):
         times = places_of(motion, between)
         moving, moving_margins = _prove(MovingProver(problem.robot, problem.moving, q, times, off), {"": 0.0})
-        margins[SCENE] = min(margins[SCENE], *moving_margins.values())  # also of an obstacle named "scene"
+        margins[SCENE] = min(margins[SCENE], *moving_margins.values())  # SCENE: an obstacle named "scene"
     record = None
     with suppress(InputError):  # the robot may have been made in this program, and have no file
         record = problem_record(problem)
@@ -316,7 +316,7 @@ def _between(motion: Path | Trajectory, chord: float) -> Values:
 
 def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[str, float]]:
     """A proof of all claims, and the clearance that it proves for each kind of claim: SCENE for the scene, ""
-    for pairs of links. least: the clearance to prove for each kind [m]."""
+    for pairs of links or moving obstacles. least: the clearance to prove for each kind [m]."""
     count = len(prover.claims)
     last = float(len(prover.q) - 1)
     todo = Stretches(np.arange(count), np.zeros(count), np.full(count, last))

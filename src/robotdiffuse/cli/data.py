@@ -83,7 +83,7 @@ def _gallery_entries(folder: Path, robot: Robot, number: int, seed: int) -> Iter
             family = list(manifest.families)[int(shard["family"][row])]
             scene = scenes_of(manifest, shard, slice(row, row + 1)).scene(0)
             cost, detour, clearance = (float(shard[name][row]) for name in ("cost", "detour", "clearance"))
-            line = "line free" if shard["line_free"][row] else f"detour {detour:.2f}"
+            line = "trivial" if shard["line_free"][row] else f"detour {detour:.2f}"
             caption = f"{cost:.2f} rad · {line} · {100 * clearance:.1f} cm clear"
             title = f"{family} · shard {shard.index}, row {row}"
             yield GalleryEntry(title, caption, scene, motion_of(robot, shard, row))

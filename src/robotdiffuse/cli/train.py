@@ -70,7 +70,7 @@ def run_planner(arguments: Namespace) -> None:
     options = chosen(arguments, ("data", "encoder", "robot", "device", *TRAINING_OPTIONS, *MODEL_OPTIONS))
     config = CONFIGS[arguments.config].changes
     if "denoiser" in options and config.get("denoiser_settings") is not None:
-        # the config's settings are for its own denoiser; another denoiser gets its paper-sized settings
+        # the config's settings are for its own denoiser; another gets those of its paper, or its defaults
         options["denoiser_settings"] = PAPER_SIZES.get(arguments.denoiser) or DENOISERS.defaults(
             arguments.denoiser
         )

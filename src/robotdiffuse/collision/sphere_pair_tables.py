@@ -42,8 +42,8 @@ def build_pair_tables(
     """The rows of `RobotArrays.pairs`, with table and bit filled in for pairs that depend on one or two
     joints, and the tables.
 
-    A table is a row of numbers: index, lower end and cells per unit of the first joint, then of the second
-    joint, then the cells. A cell is the sum of the bits of the pairs that may touch there.
+    A table is a row of numbers: index, lower end of the table and cells per unit of the first joint, then of
+    the second joint, then the cells. A cell is the sum of the bits of the pairs that may touch there.
 
     Args:
         arrays: The RobotArrays without tables.
@@ -62,8 +62,8 @@ def build_pair_tables(
     for p, (a, b) in enumerate(arrays.pairs[:, :2].tolist()):
         near, far = sorted((int(arrays.frame[a]), int(arrays.frame[b])))
         pairs = pairs_by_joint.setdefault(far - 1, [])
-        before = int(parents[far - 1])
-        if near in (before, parents[before - 1] if before else 0) and len(pairs) < MAX_PAIRS:
+        parent = int(parents[far - 1])
+        if near in (parent, parents[parent - 1] if parent else 0) and len(pairs) < MAX_PAIRS:
             pairs.append(p)
     # one table for all pairs with the same last joint; the table's other axis is the joint before
     for last, pairs in pairs_by_joint.items():

@@ -47,8 +47,9 @@ class PlanResult:
     robot: str
     """Name of the robot."""
     planning_time: float
-    """Wall time of plan() until the returned path is validated [s], without loading time; the path's final
-    time parameterization follows and does not count."""
+    """Wall time of plan() until the returned path is validated [s], without loading time. The path's final
+    time parameterization follows and does not count, except with waypoints, camera views or moving
+    obstacles."""
     seed: int
     """Seed of the random numbers."""
     stage: str = ""
@@ -84,8 +85,8 @@ class PlanResult:
     """Sum of the predicted occupancy probabilities of all unknown voxels that the motion sweeps; None without
     the predicted policy for unknown space."""
     unknown_region: tuple[tuple[float, ...], tuple[float, ...]] | None = None
-    """Lower and upper corner, in the base frame [m], of a box around the most probably occupied part of the
-    unknown space that the motion crosses; None if it crosses no unknown space."""
+    """Lower and upper corner, in the base frame [m], of a box around the part of the unknown space
+    that the motion crosses with the largest summed probability to be occupied; None if it crosses none."""
     fraction: float | None = None
     """Problems with a Cartesian line: the fraction of the line that the arm can follow from the start, 1 if
     there is a motion. If it is below 1, `reason` says what stops the arm."""

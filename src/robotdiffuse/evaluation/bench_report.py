@@ -49,9 +49,9 @@ UNEQUAL_NOTE = (
     "repeats such calls until the limit."
 )
 NOTES = """\
-- A call counts for a limit if its own limit was at least as long, or if it ended by itself before its
-  limit, since more time would change nothing. A table compares the problems on which all its planners have
-  such a call.
+- A call counts in a table if its limit was at least the table's, or if it ended by itself before its limit,
+  since more time would change nothing. A table compares the problems on which all its planners have such a
+  call.
 - success: share of problems with a verified motion found by the limit, with the 95 % interval over problems
   (Wilson). A motion that a call returned up to 10 % or 50 ms after its own limit counts: planners stop in
   time, and validation follows.
@@ -59,24 +59,25 @@ NOTES = """\
 - link length: the paper's path length, the sum of the path lengths of all links that joints move. It is the
   mean over the problems that the planner itself solved, so planners that solve only easy problems have
   short paths. If a call continued after the limit and returned a shorter path, the length at the limit is
-  estimated by the length of the returned path, scaled by the ratio of the joint lengths.
+  estimated: the returned path's link length, times the ratio of both paths' lengths in joint space.
 - joint length / a planner: median ratio of the length in joint space to that of the reference planner, on
-  problems that both solve, with its 95 % interval (bootstrap over problems). Both planners must use up the
-  limit, so that the ratio is at equal time. restarted: a planner that ends earlier is called again with
-  other seeds until all its calls together have used up the limit, and its shortest path counts. Computing
-  trajectories of the other paths is not counted.
-- first: median time to the first path of solved problems. returns: mean time until the planner returns.
+  problems that both solve, with its 95 % interval (bootstrap over problems). The ratio is at equal time if
+  both planners use up the limit; † marks other ratios. restarted: a planner that ends earlier is called again
+  with other seeds until all its calls together have used up the limit, and its shortest path counts.
+  Computing trajectories is not counted.
+- first: median time to the first path of solved problems. returns: mean time until the planner returns,
+without computing the trajectory.
   Anytime planners use up the limit, and unsolved problems count with the limit.
 - ComScore: as in the paper, the mean of success, collision, length and time until the planner returns, each
   scaled from 0 for the worst row of the table to 1 for the best. It depends on the rows of the table; rows
   with restarts are left out. `robotdiffuse reproduce table1` computes it among the paper's rows.
-- Quality: means over the solved problems (of means over their motions), 95 % intervals. clearance: a lower
+- Quality: means over seeds, then over the solved problems, with 95 % intervals. clearance: a lower
   bound of the distance to obstacles (scene), between links of the arm (self), and the smaller of the two
   (min). over straight line: duration divided by the shortest time along the straight line without obstacles
-  and jerk limits. stops: how often the whole arm stops on the way. peak and mean jerk: of the joint with
-  the largest jerk. bending: integral of the squared second derivative of the path, divided by the squared
-  length. jerk: logarithm of the dimensionless jerk, lower is smoother. sparc: spectral arc length of the
-  speed of the joints or of the tip, closer to 0 is smoother.
+  and jerk limits. stops: how often the whole arm stops on the way. peak and mean jerk: of the joint with the
+  largest jerk at each time. bending: integral of the squared second derivative of the path, divided by the
+  squared length. jerk: logarithm of the dimensionless jerk, lower is smoother. sparc: spectral arc length of
+  the speed of the joints or of the tip, closer to 0 is smoother.
 - p of success: McNemar's exact test. p of joint length: Wilcoxon's signed-rank test. Neither is corrected
   for the number of comparisons. With several seeds, a problem counts as solved if it is solved with more
   than half of the seeds."""
@@ -128,8 +129,8 @@ def tables(section: Section, comparison: Comparison, reference: str) -> list[Tab
         for family in dict.fromkeys(o.record.family for o in comparison.rows[0].outcomes)
     ]
     pairs: Spec = (
-        _of_pair("alone solves", lambda pair: pair.a_only),
-        _of_pair("reference alone", lambda pair: pair.b_only),
+        _of_pair("only this solves", lambda pair: pair.a_only),
+        _of_pair("only reference", lambda pair: pair.b_only),
         _of_pair("both", lambda pair: pair.both),
         _of_pair("neither", lambda pair: pair.neither),
         _of_pair("p of success", lambda pair: probability(pair.p_success)),
@@ -189,7 +190,8 @@ def _table(heading: str, rows: Sequence[Row], spec: Spec) -> Table:
 
 def _ratio(comparison: Comparison, reference: str) -> PlannerColumn:
     """A column with the ratio of path lengths to those of the reference planner, and its interval. The cell
-    is empty for a planner that ended early and also has a row with restarts, which shows the ratio."""
+    is empty if the planner or the reference ended early and there is a row with restarts, which shows the
+    ratio."""
     full = {row.planner: row.full for row in comparison.rows}
 
     def ratio(row: Row) -> Cell:
@@ -292,7 +294,7 @@ def bench_report(bench: Bench, parts: Sequence[Section], replays: str | None = N
             calls = f"share of {section.curves[0].calls} calls"
             caption = f"Success over time, {calls}; planners with a network solid, search dashed"
             report.plot(f"success_{file}.svg", caption, success_over_time(section, planners))
-            caption = "Length over time, median over the best known, of non-trivial problems"
+            caption = "Length relative to the best known, over time; median of the non-trivial problems"
             report.plot(f"length_{file}.svg", caption, length_over_time(section, planners))
         for comparison in section.comparisons:
             main, *further_tables = tables(section, comparison, bench.reference)
@@ -324,7 +326,7 @@ def about(bench: Bench) -> list[str]:
     for run in bench.sessions:
         versions = ", ".join(f"{name} {version}" for name, version in run["versions"].items())
         machine = f"{run.get('processor', '?')}, {run.get('cores', '?')} cores"
-        text = f"{machine}, {run.get('workers', '?')} at once; Python {run.get('python', '?')}, {versions}"
+        text = f"{machine}, {run.get('workers', '?')} workers; Python {run.get('python', '?')}, {versions}"
         dates.setdefault(text, []).append(run["date"])
     return [
         f"{days[0] if min(days) == max(days) else f'{min(days)} to {max(days)}'} UTC: {text}"

@@ -162,7 +162,8 @@ def choose_topic(topics: Mapping[str, str], requested: str | None, where: str) -
 
     It is `requested` if that is given. Otherwise, the types JointTrajectory, RobotTrajectory,
     DisplayTrajectory and JointState are tried in this order, and the first one that occurs must have a single
-    topic. Raises InputError if `requested` or no topic has one of these types, or if several have the first.
+    topic. Raises InputError if `requested` or every topic has another type, or if several topics have the
+    first.
     """
     kinds = (JOINT_TRAJECTORY, ROBOT_TRAJECTORY, DISPLAY_TRAJECTORY, JOINT_STATE)
     listed = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"

@@ -1,7 +1,7 @@
 """Files of trained networks, read without PyTorch.
 
-NAME.json describes a network and holds the SHA-256 of its other files. NAME.safetensors holds the weights for
-training. NAME.onnx, and further files that end in .onnx, hold the exported parts that planning runs.
+NAME.json describes a network and holds the SHA-256 of its other files. NAME.safetensors holds the weights.
+NAME.onnx, and further files that end in .onnx, hold the exported parts that planning runs without PyTorch.
 """
 
 import hashlib
@@ -260,7 +260,8 @@ def check_weights(name: str, folder: str | FilePath | None) -> None:
 
 
 def weights_folder(name: str, folder: str | FilePath | None, robot: Robot) -> FilePath:
-    """The folder with weights of a network: the given folder, or the folder from `weights_for`.
+    """The folder with weights of a network: the given folder, the folder from `weights_for`, or the bundled
+    one of another arm with the robot's name.
 
     Raises InputError if it holds no such weights, naming the command that trains them.
     """
@@ -271,7 +272,7 @@ def weights_folder(name: str, folder: str | FilePath | None, robot: Robot) -> Fi
         return fitting
     bundled = BUNDLED / robot.name
     if (bundled / f"{name}.json").is_file():
-        return bundled  # made for another arm of the same name; the caller reports that
+        return bundled  # the caller reports that it is for another arm
     raise no_weights_error(name, f"no weights of the network {name} come with the package for {robot.name}")
 
 

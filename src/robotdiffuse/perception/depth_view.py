@@ -38,7 +38,7 @@ MIN_FOCAL_LENGTH = 1e-3
 NEAREST = 0.05
 """Nearer returns are ignored: they come from something that covers the lens [m]."""
 FARTHEST = 50.0
-"""An image of which half of the returns are farther is not in meters, or has numbers for no return [m]."""
+"""If half of an image's returns are farther, it is not in meters, or has a number for no return [m]."""
 MAX_ANGLE = 0.5
 """Largest angle that `DepthView.pose_deviation` may state [rad]."""
 INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -72,7 +72,7 @@ class DepthView(Value):
     """The original points [m], if the image was made from a cloud; in the image, each pixel holds only its
     nearest point."""
     source: dict[str, str | float] | None = None
-    """The image's entry in problem files: `depth`, a file name, and its `scale`, or `cloud`, a file name."""
+    """The image's entry in problem files: a file as `depth`, and its `scale`; or a file as `cloud`."""
     range: float | None = None
     """Largest distance that the sensor measures [m]. If it is given, large regions of 0 at the border of the
     image mean that nothing is within this distance, unless the image seems to be cropped there. None: a pixel
@@ -247,13 +247,14 @@ class DepthNoise(Settings, name="depth_noise"):
     missing: ShareBelowOne = 0.0
     """Fraction of all pixels that have no return."""
     stray: ShareBelowOne = 0.01
-    """Fraction of all pixels whose depth is somewhere between the camera and the surface."""
+    """Fraction of the pixels with a return whose depth is somewhere between the camera and the surface."""
     flying: ShareBelowOne = 0.3
     """Fraction of the pixels at edges whose depth is between the two surfaces (flying pixels)."""
     edge_missing: ShareBelowOne = 0.3
     """Fraction of the pixels at edges without a return."""
     edge: Positive = 0.05
-    """Neighboring pixels whose depths differ by more than this are at an edge [m]."""
+    """A pixel whose depth differs from that of the next pixel to the right or below by more than this is at
+    an edge [m]."""
     grazing: Angle = 0.17
     """Surfaces at a smaller angle to the line of sight give no return [rad]."""
     correlation: NotNegative = 0.0

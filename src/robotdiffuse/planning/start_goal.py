@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.compiled_constraints import PathConstraints
 
 GOAL_TIME_FRACTION = 0.5
-"""After this fraction of the time limit, no further ones of several goals are tried. But the first pass over
-the goals goes on until one is free, and the second tries at least one."""
+"""Of several goals, no more are tried after this fraction of the time limit. But the first pass over the
+goals goes on until one is free, and the second tries at least one."""
 NEAR_POSE_FRACTIONS = (0.1, 0.3, 0.9)
-"""If no configuration reaches a pose exactly, configurations are projected onto the pose with these fractions
-of the validator's goal tolerances, in this order."""
+"""If no configuration reaches a pose exactly, some within these fractions of the validator's goal tolerances
+are sought, in this order."""
 NEAR_POSE_ROUNDS = 2
 """Number of rounds of seeds for each of NEAR_POSE_FRACTIONS."""
 FIRST_TRY_COUNT = 3
@@ -63,7 +63,7 @@ class StartGoal:
     itself.
 
     Whole turns are removed from continuous joints of the start; `complete` adds them to the path. Each goal
-    is replaced by its images, see `images`; images without a lead are dropped.
+    is replaced by its copies, see `copies`; copies without a lead are dropped.
     """
 
     def __init__(
@@ -85,14 +85,14 @@ class StartGoal:
         self.checker = checker
         self._turns = robot.whole_turns(start)
         self.start = start - self._turns
-        goal_images = [image for goal in goals for image in images(robot, self.start, goal)]
-        states = [self.start, *goal_images]
+        goal_copies = [copy for goal in goals for copy in copies(robot, self.start, goal)]
+        states = [self.start, *goal_copies]
         free = checker.free(np.stack(states))  # one batch, since most are free
         self.start_lead, *leads = (
             q.copy() if is_free and constraints is None else retreat(checker, q, constraints)
             for q, is_free in zip(states, free, strict=True)
         )
-        self.goals = [goal for goal, lead in zip(goal_images, leads, strict=True) if lead is not None]
+        self.goals = [goal for goal, lead in zip(goal_copies, leads, strict=True) if lead is not None]
         self.goal_leads = [lead for lead in leads if lead is not None]
 
     def leads(self) -> tuple[Configuration, Configurations]:
@@ -179,27 +179,27 @@ def falling_clearances(most: float, checker: CollisionChecker, states: Configura
     )
 
 
-def images(robot: Robot, start: Configuration, goal: Configuration) -> list[Configuration]:
+def copies(robot: Robot, start: Configuration, goal: Configuration) -> list[Configuration]:
     """Copies of the goal with whole turns added to continuous joints, since a search does not wrap angles.
 
     First the copy nearest to the start. Then, for each continuous joint, a copy in which this joint turns the
     other way, because an obstacle may block the shorter way.
     """
     nearest = goal - robot.whole_turns(goal - start)
-    images = [nearest]
+    result = [nearest]
     for j in np.flatnonzero(robot.continuous):
-        image = nearest.copy()
-        image[j] -= np.copysign(2 * np.pi, nearest[j] - start[j])
-        images.append(image)
-    return images
+        copy = nearest.copy()
+        copy[j] -= np.copysign(2 * np.pi, nearest[j] - start[j])
+        result.append(copy)
+    return result
 
 
 def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
     """The start and the goals for the search of a call; a failed result if there are none.
 
-    A pose gives up to `pose_goals.GOAL_COUNT` configurations whose covering spheres are free, up to
-    MAX_GRAZING_GOALS nearer ones of which only the exact meshes are free, and copies of these with whole
-    turns. Of joint goals, those of which only the meshes are free are used if the spheres of none are free.
+    A pose gives at most `pose_goals.GOAL_COUNT` configurations whose covering spheres are free, at most
+    MAX_GRAZING_GOALS nearer to the start with only the exact meshes free, and copies of all with whole turns.
+    Joint goals with only the meshes free are used if no joint goal has free spheres.
     Several goals are tried with little work each; only if none is free, they are tried again with more.
     """
     checker = CollisionChecker(context.problem.robot, context.problem.scene)
@@ -444,8 +444,8 @@ def _pose_goals(
     if not len(rejected):
         # of several poses, name those that cannot be reached even alone, or all
         several = poses_of(goal) if len(place_of) > 1 else ()
-        alone = [pose.frame for pose in several if not len(pose_configurations(unconstrained, pose, rng))]
-        unreached = " and ".join(f"{frame} to the pose at {place_of[frame]}" for frame in alone or place_of)
+        never = [pose.frame for pose in several if not len(pose_configurations(unconstrained, pose, rng))]
+        unreached = " and ".join(f"{frame} to the pose at {place_of[frame]}" for frame in never or place_of)
         return context.fail(
             Status.UNREACHABLE_GOAL, f"no configuration within the joint limits brings {unreached}"
         )

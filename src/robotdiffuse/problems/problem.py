@@ -467,8 +467,8 @@ class Problem(Value):
             q: A configuration [dof], or several [n, dof].
 
         Returns:
-            The bound [m], one for each row, positive if free of collision. It is capped at 1 m, and at 0.3 m
-            if the nearest obstacle is a point cloud or a mesh.
+            The bound [m], one for each row: the arm is free of collision if it is positive. It is capped at
+            1 m, or at 0.3 m in scenes with point clouds or meshes.
 
         Raises:
             InputError: For q of the wrong shape.

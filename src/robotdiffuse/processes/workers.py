@@ -106,7 +106,7 @@ class Worker:
         self._arguments = arguments
         self._running: tuple[BaseProcess, Connection] | None = None
         self._starting = threading.Lock()
-        """Held while the process starts; if this one exited then, the new one would print a traceback."""
+        """Held while the process starts; if its parent exited then, it would print a traceback."""
         self._number = 0
         """Number of the last call in the process."""
         self._closed = False
@@ -137,7 +137,7 @@ class Worker:
             self._running = (process, connection)
             self._number = 0
         try:
-            connection.recv()  # writing before would block forever if the process ends
+            connection.recv()  # the process has started; only now can it take a call
         except (EOFError, OSError):
             self.end(0.0)
             raise EndedError("closed") if self._closed else _not_started() from None

@@ -97,7 +97,7 @@ def read_scene(
 
 
 def read_shape(where: str, entry: object, folder: Path, notes: list[str]) -> Shape:
-    """The shape of an entry such as {box: {...}}; as `read_scene`. Notes are added to `notes`."""
+    """The shape of an entry such as {box: {...}}; see `read_scene`. Notes are added to `notes`."""
     kind, values = only_field(where, entry, SHAPES, "one shape, e.g. {sphere: {...}}")
     return _shape(f"{where}.{kind}", SHAPES[kind], values, folder, notes)
 

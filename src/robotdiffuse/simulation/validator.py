@@ -62,12 +62,12 @@ class PyBulletOracle(World):
         """Whether any pair penetrates deeper than the tolerance [m]."""
         return self.nearest(q, -tolerance) is not None
 
-    def check_frames(self, q: Configurations, tolerance: float = 0.001) -> OracleContact | None:
+    def check_rows(self, q: Configurations, tolerance: float = 0.001) -> OracleContact | None:
         """The first contact deeper than the tolerance [m] among these configurations, or None.
 
-        Its `at` is the row. Each configuration takes one call of Bullet's broad phase for all pairs (20 us
+        Its `at` is the row. Each configuration takes one collision detection of Bullet for all pairs (20 us
         for a Panda, an eighth of `nearest`); `nearest` confirms the contacts found. Raises InputError for a
-        negative tolerance, because the broad phase finds only contacts.
+        negative tolerance, because the detection finds only contacts.
         """
         if tolerance < 0:
             raise InputError(f"tolerance is {tolerance}; it must not be negative")
@@ -88,7 +88,7 @@ class PyBulletOracle(World):
         of Bullet's distances.
         """
         places, q = sample_path(path.positions, step)
-        contact = self.check_frames(q, tolerance)
+        contact = self.check_rows(q, tolerance)
         return None if contact is None else replace(contact, at=float(places[int(contact.at)]))
 
     def _closer(

@@ -68,7 +68,7 @@ class Solids(NamedTuple):
     """[n] whether the solid is only the bounding box of a surface or a point cloud. Exact distances to such
     obstacles are left to Coal."""
     may_touch: np.ndarray
-    """[checks, n] whether the link of a check may touch the obstacle; shape [0, 0] without allowed
+    """[checks, n] whether the link of each `Check` may touch the obstacle; shape [0, 0] without allowed
     contacts."""
 
 
@@ -119,21 +119,21 @@ def pose(offsets, parents, slides, q, dq, posture):
 
 
 @inner_kernel()
-def relative_twist(posture, frame, base):
-    """The motion of one frame relative to the frame `base`: its angular velocity, and the velocity of its
-    point that is at the origin. All vectors are in the robot's base frame."""
+def relative_twist(posture, frame, reference):
+    """The motion of one frame relative to the frame `reference`: its angular velocity, and the velocity of
+    its point at the origin of the robot's base frame, in which all vectors are."""
     twist = posture.twists[frame]
-    base_twist = posture.twists[base]
-    return minus(twist, base_twist), minus(twist[3:], base_twist[3:])
+    reference_twist = posture.twists[reference]
+    return minus(twist, reference_twist), minus(twist[3:], reference_twist[3:])
 
 
 @inner_kernel()
-def part_travel(hulls, p, base, posture):
-    """Upper bound on how far any point of a part moves, relative to frame `base`, from the middle of the
+def part_travel(hulls, p, reference, posture):
+    """Upper bound on how far any point of a part moves, relative to frame `reference`, from the middle of the
     motion to either of its ends [m]; the remainder r (see the module's docstring) is not included."""
     frame = hulls.frame[p]
     ball = hulls.balls[p]
-    turning, moving = relative_twist(posture, frame, base)
+    turning, moving = relative_twist(posture, frame, reference)
     velocity = plus(cross(turning, placed(posture.frames[frame], ball)), moving)
     return length(velocity) + ball[3] * length(turning)
 
@@ -151,7 +151,7 @@ def ball_to_solid(hulls, p, solids, o, posture):
 @inner_kernel(fastmath=True)
 def _lowest(vertices, first, last, n, m, speed):
     """Minimum over vertices of a - |b|. a is the vertex's height along the normal n, b its speed along the
-    normal: `speed` plus its product with m."""
+    normal: `speed` plus vertex . m."""
     minimum = np.inf
     for i in range(first, last):
         a = vertices[0, i] * n[0] + vertices[1, i] * n[1] + vertices[2, i] * n[2]
@@ -193,12 +193,12 @@ def _support_of_solid(solids, o, posture):
 
 
 @inner_kernel()
-def _lowest_along(hulls, p, base, sign, posture):
+def _lowest_along(hulls, p, reference, sign, posture):
     """Minimum height of a part in the direction sign * points[0] at the start and at the end of the motion
-    [m]. The remainder r is left out; velocities are relative to frame `base`."""
+    [m]. The remainder r is left out; velocities are relative to frame `reference`."""
     n = posture.points[0]
     frame = hulls.frame[p]
-    turning, moving = relative_twist(posture, frame, base)
+    turning, moving = relative_twist(posture, frame, reference)
     at_start = np.inf
     at_stop = np.inf
     for i in range(hulls.first[p], hulls.first[p + 1]):
@@ -211,19 +211,19 @@ def _lowest_along(hulls, p, base, sign, posture):
 
 
 @inner_kernel()
-def separation(hulls, p, solids, other, base, posture):
+def separation(hulls, p, solids, other, reference, posture):
     """Widths of the gap between two bodies along the unit normal points[0] [m].
 
     Returns the gap in the middle of the motion, and the smallest gap along the motion. The smallest gap
-    leaves out the remainder r (see the module's docstring) and uses velocities relative to frame `base`.
+    leaves out the remainder r (see the module's docstring) and uses velocities relative to frame `reference`.
     `other` is the index of an obstacle or, if negative, -1 minus the index of a part. If this part is not
-    fixed to frame `base`, its motion is included.
+    fixed to frame `reference`, its motion is included.
     """
     n = posture.points[0]
     frame = hulls.frame[p]
     T = posture.frames[frame]
     origin = column(T, 3)
-    turning, moving = relative_twist(posture, frame, base)
+    turning, moving = relative_twist(posture, frame, reference)
     # n . (w x p) = (n x w) . p
     turned = cross(n, turning)
     speed = dot(turned, origin) + dot(n, moving)
@@ -241,9 +241,9 @@ def separation(hulls, p, solids, other, base, posture):
         _support_of_part(hulls, -1 - other, posture, 1.0, 2)
         reach = hulls.rounding[-1 - other]
     reach += dot(n, posture.points[2])
-    if other < 0 and hulls.frame[-1 - other] != base:
-        start, stop = _lowest_along(hulls, p, base, 1.0, posture)
-        other_start, other_stop = _lowest_along(hulls, -1 - other, base, -1.0, posture)
+    if other < 0 and hulls.frame[-1 - other] != reference:
+        start, stop = _lowest_along(hulls, p, reference, 1.0, posture)
+        other_start, other_stop = _lowest_along(hulls, -1 - other, reference, -1.0, posture)
         return middle - reach - 1e-9, min(start + other_start, stop + other_stop) - 1e-9
     # 1e-9 covers floating-point errors in the length of the normal, which are multiplied by the size of the
     # bodies
@@ -358,18 +358,18 @@ def find_plane(hulls, p, solids, other, posture):
 
 
 @kernel()
-def best_plane(hulls, p, solids, other, base, enough, plane, posture):
+def best_plane(hulls, p, solids, other, reference, enough, plane, posture):
     """Gaps between two bodies along the normal of a separating plane [m], and whether GJK was run.
 
     The first gap is in the middle of the motion, the second is the smallest along the motion, without the
-    remainder r. GJK is run only if the gap of `plane`, the last plane of this pair, is less than `enough`
-    along the motion; then `plane` is replaced. After GJK, the first gap is at most about 2 % below the
-    distance, or -inf if the bodies touch or nearly touch.
+    remainder r. GJK is run only if `plane`, the last plane of this pair, is zero or shows a gap of less than
+    `enough` along the motion. It replaces `plane`, unless the bodies touch or nearly touch. After GJK, the
+    first gap is at most about 2 % below the distance, or -inf if the bodies touch or nearly touch.
     """
     n = posture.points[0]
     write(plane, n)
     if plane.any():
-        middle, along = separation(hulls, p, solids, other, base, posture)
+        middle, along = separation(hulls, p, solids, other, reference, posture)
         if along >= enough:
             return middle, along, False
     else:
@@ -385,5 +385,5 @@ def best_plane(hulls, p, solids, other, base, enough, plane, posture):
     if not find_plane(hulls, p, solids, other, posture):
         return -np.inf, -np.inf, True
     write(n, plane)
-    middle, along = separation(hulls, p, solids, other, base, posture)
+    middle, along = separation(hulls, p, solids, other, reference, posture)
     return middle, along, True

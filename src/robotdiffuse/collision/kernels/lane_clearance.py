@@ -65,7 +65,8 @@ class ClearanceWorkspace(NamedTuple):
     """[obstacles] whether the obstacle may be the nearest one of a group in any lane; the last entry stands
     for all points."""
     bounds: np.ndarray
-    """[obstacles, W] distances of the obstacles from the center of a group's bounding sphere [m]."""
+    """[obstacles, W] distances of the obstacles from the center of a group's bounding sphere [m]; the last
+    entry is a lower bound."""
     need: np.ndarray
     """[1, W] clearances are computed up to this value [m]; a lane with a negative value is skipped."""
     clearance: np.ndarray
@@ -99,7 +100,8 @@ def make_clearance_workspace(robot, solids):
 @allocation_free(forceinline=True)
 def to_solid(points, velocities, solid):
     """Signed distances of the points in 16 lanes to a row of `SceneArrays.solids`, and the components of the
-    points' velocities along the lines to the solid's nearest points, as absolute values."""
+    points' velocities along the lines to the solid's nearest points, as absolute values; 0 inside its box or
+    disc."""
     u, v, w = in_axes(solid, minus(points, solid))
     # velocity in the solid's axes; multiplied by the sign of the coordinate, it is the speed away from the
     # center
@@ -214,21 +216,21 @@ def _mark_near(robot, scene, g, speed, work):
 
 
 @allocation_free(forceinline=True)
-def group_along(robot, scene, g, moving, work):
+def group_along(robot, scene, g, swept, work):
     """Writes to `work` the clearances of group g to the scene, at most `work.need`, and lower bounds of the
-    clearances along the motions. Without `moving` the twists count as zero."""
+    clearances along the motions. Without `swept` the twists count as zero."""
     frame = robot.frame[g]
     solids = len(scene.solids)
     centers = load_vector(work.centers, g, 0)
     still = minus(centers, centers)
-    speed = _speed(work.twists, frame, 0, centers, robot.bounds[g, 3]) if moving else still[0]
+    speed = _speed(work.twists, frame, 0, centers, robot.bounds[g, 3]) if swept else still[0]
     _reset(work)
     if not _mark_near(robot, scene, g, speed, work):
         return
     _place_group(robot, g, work)
     for s in range(robot.first[g], robot.first[g + 1]):
         centers = load_vector(work.positions, s, 0)
-        velocities = _velocity(work.twists, frame, centers) if moving else still
+        velocities = _velocity(work.twists, frame, centers) if swept else still
         radius = robot.spheres[s, 3]
         for k in range(solids):
             if work.near[k]:
@@ -246,7 +248,7 @@ def group_along(robot, scene, g, moving, work):
 
 
 @allocation_free(forceinline=True)
-def pair_along(robot, p, moving, work):
+def pair_along(robot, p, swept, work):
     """Like `group_along`, for the clearance between the links of a checked pair."""
     a = robot.pairs[p, 0]
     b = robot.pairs[p, 1]
@@ -258,7 +260,7 @@ def pair_along(robot, p, moving, work):
     centers = load_vector(work.centers, a, 0)
     other_center = load_vector(work.centers, b, 0)
     still = minus(centers, centers)
-    speed = _speed(twists, f, g, centers, bounds[a, 3]) if moving else still[0]
+    speed = _speed(twists, f, g, centers, bounds[a, 3]) if swept else still[0]
     _reset(work)
     gap = _length(minus(centers, other_center)) - (bounds[a, 3] + bounds[b, 3])
     if (gap - speed < load(work.clearance, 0, 0)) == 0:
@@ -267,16 +269,16 @@ def pair_along(robot, p, moving, work):
     _place_group(robot, b, work)
     for s in range(robot.first[a], robot.first[a + 1]):
         centers = load_vector(work.positions, s, 0)
-        speed = _speed(twists, f, g, centers, _ZERO) if moving else still[0]
+        speed = _speed(twists, f, g, centers, _ZERO) if swept else still[0]
         gap = _length(minus(centers, other_center)) - (spheres[s, 3] + bounds[b, 3])
         if (gap - speed < load(work.clearance, 0, 0)) == 0:
             continue
-        velocities = _velocity(twists, f, centers) if moving else still
+        velocities = _velocity(twists, f, centers) if swept else still
         for t in range(robot.first[b], robot.first[b + 1]):
             partners = load_vector(work.positions, t, 0)
             # only the difference of the velocities along the line between the centers matters; this
             # difference is the same in every frame of reference
-            relative = minus(velocities, _velocity(twists, g, partners) if moving else still)
+            relative = minus(velocities, _velocity(twists, g, partners) if swept else still)
             offset = minus(centers, partners)
             distance = _length(offset)
             towards = absolute(dot(offset, relative)) / maximum(distance, _TINY)

@@ -1,4 +1,4 @@
-"""Denoisers, networks that predict the clean trajectory from a noisy one, and their settings.
+"""Denoisers, networks that predict the clean trajectory, or its noise, from a noisy one, and their settings.
 
 Nothing here loads PyTorch, so that planning can read the settings. The networks are in `denoisers.networks`.
 
@@ -39,7 +39,7 @@ class AttentionSettings(DenoiserSettings):
     """
 
     causal: ClassVar[bool] = False
-    """Whether waypoints attend only to z_tk and the waypoints before them."""
+    """Whether waypoints attend only to z_tk, the waypoints before them and those of their own patch."""
     points: ClassVar[bool] = False
     """Whether waypoints also attend to points of the scene (encoder `points`). The points replace z, the
     vector in which other encoders describe the scene."""

@@ -101,15 +101,15 @@ def _motions(context: PlanningContext, segments: Sequence[PlanResult]) -> list[T
             run = segments[first : k + 1]
             stopping = [segment.trajectory for segment in run]
             blended = _without_stops(context, run, first) if len(run) > 1 else None
-            longest = sum(motion.duration for motion in stopping)
-            motions += [blended] if blended is not None and blended.duration < longest else stopping
+            stopped = sum(motion.duration for motion in stopping)
+            motions += [blended] if blended is not None and blended.duration < stopped else stopping
             first = k + 1
     return motions
 
 
 def _without_stops(context: PlanningContext, segments: Sequence[PlanResult], first: int) -> Trajectory | None:
-    """One motion along several segments without stops; None if the validator refuses it. first: index of the
-    first segment."""
+    """One motion along several segments without stops; None if the validator refuses it or the time is over.
+    first: index of the first segment."""
     problem = context.problem
     last = first + len(segments) - 1
     goals = (*problem.waypoints, problem.goal)
@@ -130,11 +130,11 @@ def _without_stops(context: PlanningContext, segments: Sequence[PlanResult], fir
     for row, goal, radius in zip(corners, part.waypoints, blend, strict=True):
         deviations[row] = _deviation(part, path, int(row), goal, radius)
     clearance = min(combined.clearance, *(segment.min_clearance for segment in segments))
-    distant = verifier(part, replace(DEFAULT, contact=max(clearance, DEFAULT.contact)))
+    padded = verifier(part, replace(DEFAULT, contact=max(clearance, DEFAULT.contact)))
     result = combined.finish(
         path.positions,
         context.planner_name,
-        keeps=lambda q: distant.collision_free(replace(path, positions=q)),
+        keeps=lambda q: padded.collision_free(replace(path, positions=q)),
         deviations=deviations,
     )
     return None if result is None else result.trajectory
@@ -217,7 +217,7 @@ def join(
         results: Results of `rd.plan` for the same robot and the same scene, without waypoints.
         blend: The joined motion passes within this distance of each place where two motions meet, without a
             stop: [m] for a pose, [rad] for a configuration; 0: it stops there. It must be 0 if the motions
-            have different path constraints.
+            have different path constraints, or Cartesian lines.
         time_limit: Wall time of the call [s].
         request: Further arguments of `rd.plan` for rounding corners: clearance, velocity_scaling, ...
 
@@ -272,8 +272,8 @@ def join(
             )
     if blend and any(len(problem.constraints) > len(shared) for problem in problems):
         raise InputError(
-            f"blend is {blend:g}, but some motions have constraints that others lack, which a rounded corner "
-            "could violate; join them with blend 0"
+            f"blend is {blend:g}, but some motions have constraints (or lines) of their own, which a rounded "
+            "corner could violate; join them with blend 0"
         )
     goals = [problem.goal for problem in problems]
     problem = replace(first, waypoints=goals[:-1], blend=blend, goal=goals[-1], constraints=shared, notes=())
@@ -294,7 +294,7 @@ def plan_from_start_velocity(planner: Solver, problem: Problem, request: PlanReq
     if len(beyond):
         j = int(beyond[0])
         raise InputError(
-            f"start_velocity: {robot.joint_names[j]} is {velocity[j]:g}; velocity_scaling leaves it "
+            f"start_velocity: {robot.joint_names[j]} is {velocity[j]:g}; velocity_scaling allows "
             f"{request.velocity_scaling * robot.velocity[j]:g}"
         )
     direction = velocity / np.linalg.norm(velocity)

@@ -95,8 +95,8 @@ class ObservedObstacle:
     def straight_on(self, now: float) -> MovingObstacle:
         """The obstacle as one that keeps its last observed velocity, from the time `now` [s] on."""
         velocity = np.zeros(3) if self.velocity is None else self.velocity
-        passed = transform((now - self.time) * velocity)
-        return MovingObstacle(self.obstacle.shape.moved(passed), velocity=velocity)
+        travel = transform((now - self.time) * velocity)
+        return MovingObstacle(self.obstacle.shape.moved(travel), velocity=velocity)
 
 
 class PredictedObstacles:
@@ -389,8 +389,9 @@ class Replanner:
         return predicted
 
     def _choose_path(self, predicted: PredictedObstacles) -> bool:
-        """Search for another path if the chosen one is predicted to be blocked or does not lead to the goal.
-        Returns whether the path that was chosen before is predicted to be free."""
+        """Search for another path if the chosen one is predicted to be blocked, or if the arm rests and the
+        path does not lead to the goal. Returns whether the path that was chosen before is predicted to be
+        free."""
         rest_time = self._rest_time
         rest = self._path.at(self._motion.s[-1])
         next_path = self._path if self._next is None else self._next
@@ -472,8 +473,8 @@ class Replanner:
         return TimedPath.certified(self._validator, best, False, self._filter)
 
     def _change_path(self) -> None:
-        """If the arm rests, change to `_next`, the path that was found in place of the current one, or at the
-        end of the current path to its continuation."""
+        """If the arm rests, change to `_next`, which replaces the current path; if there is none and the
+        current path has ended, change to its continuation."""
         if not self._rests:
             return
         following = self._next

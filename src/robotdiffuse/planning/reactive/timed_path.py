@@ -156,7 +156,7 @@ MAX_DISPLACEMENT = 0.005
 SHARE_FACTOR = 0.9
 """Factor by which accelerations are reduced, repeatedly, until MAX_DISPLACEMENT is kept."""
 GRID_TOLERANCE = 1e-4
-"""A time that is before a time of the grid by at most this fraction of a step counts as that time."""
+"""A time at most this fraction of a step before a time of the grid counts as the grid's time."""
 STILL = 1e-9
 """The arm rests if its last samples differ by less than this in each joint [rad]."""
 B_SPLINE = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
@@ -174,8 +174,9 @@ class JerkFilter:
         self.joint_names = robot.joint_names
         self.step = step
         share = ACCELERATION_FRACTION
-        # The window of the averages, in samples, follows from the jerk limits. It moves the arm off the path
-        # by half its variance times the acceleration; lower accelerations need a shorter window.
+        # The window of the averages, in samples, follows from the jerk limits. Window and spline move the arm
+        # off the path by half their variance times the acceleration; lower accelerations need a shorter
+        # window.
         while True:
             window = max(int(np.ceil(2 * share * (robot.acceleration / jerk).max() / step)), 1)
             variance = step**2 * ((window**2 - 1) / 12 + 1 / 3)
@@ -236,8 +237,8 @@ class JerkFilter:
         before = points[1:-3]
         at = points[2:-2]
         after = points[3:-1]
-        # The first row is between two times of the grid, at the fraction u of a step: powers of u, their
-        # first and second derivatives.
+        # The first row is a fraction u of a step after a time of the grid. Rows of `powers`: powers of u, and
+        # their first and second derivatives.
         powers = np.array([[1, u, u**2, u**3], [0, 1, 2 * u, 3 * u**2], [0, 0, 2, 6 * u]])
         q, v, a = powers @ B_SPLINE @ points[:4]
         return Trajectory(

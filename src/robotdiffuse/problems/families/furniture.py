@@ -55,15 +55,15 @@ PLACE_TRIES = 30
 """If this many samples of a place for an object are all occupied, the scene is sampled anew."""
 MIN_GAP = 0.01
 """Minimum distance between the objects on a table or on the ground [m]."""
-# Minimum height of tables with a region beneath, and of counters with a region inside [m].
+# Minimum free height beneath tables with a region there, and height of counters with a region inside [m].
 MIN_TABLE_HEIGHT = 0.3
 MIN_COUNTER_HEIGHT = 0.25
 MIN_OPENING = 0.16
-"""Minimum height and width of an opening that the hand is to enter [m]."""
+"""Minimum height and width of an opening of a cabinet that the hand is to enter [m]."""
 TOP_HEIGHT = 0.3
 """Height of the region above a cabinet [m]."""
 MIN_REGION = 0.1
-"""Minimum edge of a region [m]."""
+"""Minimum edge of a region in a cabinet [m]."""
 DRAWER_SHAPES = 5
 """Number of boxes that make up a drawer."""
 Cell = tuple[float, float, float, float]
@@ -112,7 +112,8 @@ def sample_target(region: Region, rng: Generator) -> Pose:
 
 @dataclass(frozen=True)
 class Furniture(Ranges, ABC):
-    """Settings of all furniture families. Every range is sampled uniformly; equal bounds fix the value."""
+    """Settings of all furniture families. Ranges are sampled uniformly, except where they say otherwise;
+    equal bounds fix the value."""
 
     bearing: Range = (-np.pi, np.pi)
     """Direction from the base to the furniture, measured from the x axis [rad]."""
@@ -164,8 +165,8 @@ class Furniture(Ranges, ABC):
             if len(regions) >= 2 and all(is_clear_of(shape, keep_out) for shape in shapes):
                 return FurnishedScene(Scene([self.floor, *shapes]), tuple(regions))
         raise InputError(
-            f"none of {MAX_TRIES} scenes of {type(self).__name__} has two regions in reach and no obstacle "
-            "in the robot's base; change distance or reach"
+            f"each of {MAX_TRIES} scenes of {type(self).__name__} lacks room, two regions in reach, or a free "
+            "place for the robot's base; change distance, reach or objects"
         )
 
     def scene(self, rng: Generator, keep_out: Spheres | None = None) -> Scene:

@@ -184,8 +184,8 @@ class PartSettings:
     concavity: float = 0.007
     """How far the hull of a part may stick out of the mesh [m]."""
     most: int = 16
-    """Largest number of parts of a link; at least two for each surface of the link, and TIGHT_PART_FACTOR
-    times as many for a link with tight places."""
+    """Largest number of parts of a link, or two for each of its surfaces if that is more. For a link with
+    tight places, TIGHT_PART_FACTOR times this number."""
     voxels: int = 400_000
     """Approximate number of voxels of the grid that measures concavity."""
     finest: float = 0.0015

@@ -29,7 +29,7 @@ from robotdiffuse.robots.fitting.convex_parts import convex_hull
 from robotdiffuse.robots.parsing.srdf import Srdf
 
 MOVABLE = ("hinge", "slide")
-DRAWN = ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
+GEOMS = ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 """Types of geoms that are converted: ellipsoids to meshes, the others to elements that `urdf.py` reads."""
 WORLD = 0
 """Index of the world body, which does not move."""
@@ -64,8 +64,9 @@ def compiled_model(path: Path) -> Any:
 
 
 def robot_bodies(model: Any) -> list[int]:
-    """The bodies of the robot, parents before children: the bodies of all kinematic trees that actuators
-    move. If actuators move no tree, the robot is all trees with hinges or slides and without a free joint."""
+    """The bodies of the robot, parents before children: the bodies of all kinematic trees that actuators of
+    joints move. If there is no such tree, the robot is all trees with hinges or slides and without a free
+    joint."""
     trees: dict[int, list[int]] = {}
     for body in range(1, model.nbody):
         trees.setdefault(int(model.body_rootid[body]), []).append(body)
@@ -83,8 +84,8 @@ def robot_bodies(model: Any) -> list[int]:
     if not chosen:
         chosen = [
             root
-            for root, tree_joints in kinds.items()
-            if tree_joints.intersection(MOVABLE) and "free" not in tree_joints
+            for root, tree_kinds in kinds.items()
+            if tree_kinds.intersection(MOVABLE) and "free" not in tree_kinds
         ]
     return [body for root in chosen for body in trees[root]]
 
@@ -285,7 +286,7 @@ class ConvertedModel:
             xx, yy, zz = map(repr, model.body_inertia[body].tolist())
             ET.SubElement(inertial, "inertia", ixx=xx, iyy=yy, izz=zz, ixy="0", ixz="0", iyz="0")
         for geom in _geoms_of(model, body):
-            if not self.masks[geom] and kind_of("Geom", model.geom_type[geom]) not in DRAWN:
+            if not self.masks[geom] and kind_of("Geom", model.geom_type[geom]) not in GEOMS:
                 continue
             element = ET.SubElement(link, "collision" if self.masks[geom] else "visual")
             T = _pose(model.geom_pos[geom], model.geom_quat[geom])
@@ -319,7 +320,7 @@ class ConvertedModel:
             name = self.name("geom", geom)
             body = self.name("body", int(self.model.geom_bodyid[geom]))
             raise InputError(
-                f"{self.path}: {name} of body {body} is of type {kind}; use one of {', '.join(DRAWN)}, or "
+                f"{self.path}: {name} of body {body} is of type {kind}; use one of {', '.join(GEOMS)}, or "
                 "let it collide with nothing (contype and conaffinity 0)"
             )
 
