@@ -165,8 +165,8 @@ class Furniture(Ranges, ABC):
             if len(regions) >= 2 and all(is_clear_of(shape, keep_out) for shape in shapes):
                 return FurnishedScene(Scene([self.floor, *shapes]), tuple(regions))
         raise InputError(
-            f"each of {MAX_TRIES} scenes of {type(self).__name__} lacks room, two regions in reach, or a free "
-            "place for the robot's base; change distance, reach or objects"
+            f"each of {MAX_TRIES} scenes of {type(self).__name__} lacks room, two regions in reach, or a "
+            "free place for the robot's base; change distance, reach or objects"
         )
 
     def scene(self, rng: Generator, keep_out: Spheres | None = None) -> Scene:
