@@ -47,7 +47,8 @@ SETTLING_TIME = 0.24
 LOOSE_TOLERANCE = 0.002
 # Weight of the rotation error against the position error, for poses that are out of reach [m/rad].
 TILT_WEIGHT = 0.01
-# The tilt is the smallest one that reaches the position, with the arm fully stretched, times this factor.
+# With the smallest tilt that reaches the position, the arm is fully stretched; the motion ends with that
+# tilt times this factor.
 TILT_MARGIN = 1.25
 # Locked joints, such as fingers, are held at multiples of this [rad] or [m].
 HELD_JOINT_STEP = 0.002
@@ -72,7 +73,8 @@ class Planner:
             1).
 
     Raises:
-        InputError: For files that cannot be read, unknown links and joints, and limits of the wrong number.
+        InputError: For files that cannot be read, unknown links, `user_joint_names` without a planned joint,
+            limits that are not a positive number for each planned joint, and `objects` that are not empty.
     """
 
     def __init__(
@@ -143,7 +145,7 @@ class Planner:
 
         Args:
             points: Points [n, 3] in the frame of the world [m].
-            resolution: Radius of the sphere around each point [m].
+            resolution: Radius of the sphere around each point [m]; at least 1 mm is used.
             name: Name of the cloud.
         """
         radius = max(positive(CLOUD, "resolution", resolution), 1e-3)

@@ -86,8 +86,8 @@ class Control(Planner[ControlSettings]):
     def candidates(
         self, start: Configuration, goals: Configurations, checker: CollisionChecker, rng: np.random.Generator
     ) -> Trajectories:
-        """Candidate motions from the start to the nearest goals, after guidance. Motions through vias are in
-        the order of the vias, the most useful first."""
+        """Candidate motions from the start, after guidance: with smooth noise to the nearest goals, else to
+        the nearest goal. Motions through vias are in the order of the vias, the most useful first."""
         settings = self.settings
         goals = nearest_goals(start, goals, settings.samples)
         robot = checker.robot
@@ -166,8 +166,8 @@ def bent(
     motions: Float[ndarray, "n waypoints dof"], start: Configuration, goal: Configuration, count: int
 ) -> Trajectories:
     """The `count` motions, forwards or backwards, that begin and end nearest to start and goal; the nearest
-    first. Each motion is bent to begin at the start and end at the goal: the offsets of its two ends from
-    them are interpolated linearly along the motion and subtracted."""
+    first. Each motion is bent to begin at the start and end at the goal: the offsets of its first row from
+    the start and of its last row from the goal are interpolated linearly along the motion and subtracted."""
     both_directions = np.concatenate([motions, motions[:, ::-1]])
     ends = np.stack([start, goal])
     distance = np.square(both_directions[:, [0, -1]] - ends).sum(axis=(1, 2))

@@ -57,7 +57,7 @@ Settings here and in the paper:
 
 | setting | here | paper |
 |---|---|---|
-| guides: cost x clearance x (weight, guided fraction) | 2 x 3 x 2 = 12 | 12, of the same kinds |
+| guides: cost x margins x (weight, guided fraction) | 2 x 3 x 2 = 12 | 12, of the same kinds |
 | trajectories per guide | 2 | 10, on a GPU |
 | denoising steps | 30 of the 255 levels, for a CPU | 255 |
 | gradient steps per denoising step | 1 | 1 |

@@ -12,8 +12,8 @@ Passages that are narrower than a step may be missed.
 Both planners use the same compiled search from the goals to the start. A* inflates the heuristic. D* Lite
 does not, so that its search can be repaired after obstacles or the start have moved. There are two
 differences from the published D* Lite. A node and its edges are checked for collision only when the node is
-expanded; until then, its rhs is a lower bound. And a repair computes the keys of all nodes again, which it
-visits anyway; the published algorithm corrects old keys by k_m.
+expanded; until then, its rhs is a lower bound. And a repair visits all nodes, so it computes all keys again;
+the published algorithm corrects old keys by k_m.
 """
 
 from collections import namedtuple
@@ -116,8 +116,8 @@ def _update_vertex(s, v):
 
 @allocation_free()
 def _choose_parent(s, v):
-    """Sets rhs(v) = min over neighbors s' of c(v, s') + g(s'), and the parent. Edges are checked for
-    collision in the order of these sums, until one is free."""
+    """Sets rhs(v) = min over neighbors u of c(v, u) + g(u), and the parent. Edges are checked for collision
+    in the order of these sums, until one is free."""
     node = s.nodes[v]
     q = s.q[v]
     node.rhs = np.inf
@@ -141,9 +141,11 @@ def _choose_parent(s, v):
 
 @allocation_free()
 def _offer(s, u):
-    """Offers node u, after its g has changed, to its neighbors as parent. A neighbor takes a cheaper parent
-    without a collision check, which follows when the neighbor is expanded. A neighbor with parent u chooses a
-    new parent if u has become more expensive."""
+    """Offers node u, after its g has changed, to its neighbors as parent. A neighbor that is not expanded
+    takes a cheaper parent without a collision check, which follows when the neighbor is expanded. An expanded
+    neighbor chooses again, with collision checks, if u is cheaper than its parent; so does a neighbor with
+    parent u if u has become more expensive. With an inflation above 1, expanded neighbors keep their
+    parents."""
     for m in range(len(s.moves)):
         v = find(s, s.nodes[u].at + s.moves[m], True)
         node = s.nodes[v]
@@ -210,8 +212,8 @@ class DStarLiteSettings(CheckedSettings, name="d_star_lite"):
     """Step of the lattice [rad], or [m] for prismatic joints."""
     joints_per_move: Count = 1
     """Largest number of joints that an edge moves, each by one step. With 1, 2, 3 and 7 joints, paths are
-    2.1, 1.6, 1.35 and 1.2 times as long as the straight line on problems of the family rop, and the search is
-    slower each time."""
+    2.1, 1.6, 1.35 and 1.2 times as long as the straight line on problems of the family rop; the more joints,
+    the slower the search."""
     max_nodes: Annotated[int, Bound(least=1.0, most=2e9)] = 2_000_000
     """Largest number of nodes in memory, besides those around the goals; a node takes about 100 bytes."""
 
@@ -220,8 +222,8 @@ class DStarLiteSettings(CheckedSettings, name="d_star_lite"):
 class AStarSettings(DStarLiteSettings, name="a_star"):
     joints_per_move: Count = 2
     inflation: Annotated[float, Bound(least=1.0, most=1000.0)] = 1.5
-    """Factor on the heuristic (weighted A*). Paths are at most this factor longer than the shortest path on
-    the lattice; with 1, the shortest path is found, but for seven joints often not in time."""
+    """Factor on the heuristic (weighted A*). Paths are at most this many times as long as the shortest path
+    on the lattice; with 1, the shortest path is found, but for seven joints often not in time."""
 
 
 class LatticeSearch:
@@ -239,7 +241,7 @@ class LatticeSearch:
         goals: Configurations,
         settings: DStarLiteSettings,
     ) -> None:
-        """Raises InputError for a lattice that is too large."""
+        """Raises InputError for a lattice with too many nodes, or too many edges at a node."""
         self.goals = goals
         self._checks = settings.resolution, settings.clearance
         robot = checker.robot
@@ -266,8 +268,8 @@ class LatticeSearch:
         costs = np.linalg.norm(moves, axis=1)
         strides = np.append(np.cumprod(counts[:0:-1])[::-1], 1)
         origin = start - spacing * below
-        cells = np.floor((goals - origin) / spacing)[:, None] + list(product((0, 1), repeat=robot.dof))
-        corners = cells[((cells > 0) & (cells < counts - 1)).all(axis=2)].astype(np.int64) @ strides
+        around = np.floor((goals - origin) / spacing)[:, None] + list(product((0, 1), repeat=robot.dof))
+        corners = around[((around > 0) & (around < counts - 1)).all(axis=2)].astype(np.int64) @ strides
         inflation = getattr(settings, "inflation", 1.0) * STRICTNESS
         lattice = origin, spacing, counts, strides, moves @ strides, costs, len(goals), corners, inflation
         # memory, with the goals as the first nodes
@@ -284,8 +286,8 @@ class LatticeSearch:
         self.update(checker, start)
 
     def update(self, checker: CollisionChecker, start: Configuration) -> None:
-        """Take over a changed scene and a new start, which is a node of the lattice. For D* Lite, `run` then
-        repairs the search."""
+        """Take over a changed scene and a new start, which must be a node of the lattice. For D* Lite, `run`
+        then repairs the search."""
         s = self._search
         at = np.round((start - s.origin) / s.spacing).astype(np.int64) @ s.strides
         space = padded_space(checker, np.vstack([start, self.goals]), *self._checks)
@@ -305,7 +307,8 @@ class LatticeSearch:
                 return outcome
 
     def path(self) -> Configurations | None:
-        """The start, the nodes at which the path that `run` found turns, and the goal; None without one."""
+        """The start, the nodes at which the path that `run` found turns, and the goal; None if it found
+        none."""
         s = self._search
         if self.cost == np.inf:
             return None

@@ -194,22 +194,22 @@ class OmplPlanner(Planner[OmplSettings]):
         target_length = (1 + OPTIMAL) * max(nearest, SAME_STATE_DISTANCE)
         best = None
         shortest = np.inf
-        searched = np.inf
+        last_length = np.inf
         search = _Search(context, start_goal, self, settings, attempt)
-        while search.run(shorter_than=max((1 - IMPROVEMENT) * searched, target_length)):
+        while search.run(shorter_than=max((1 - IMPROVEMENT) * last_length, target_length)):
             path = Path(problem.robot.joint_names, start_goal.complete(search.path()))
-            searched = search.cost
+            last_length = search.cost
             if path.length < shortest:
                 if context.validator.path(path).valid:
                     best = path.positions
                     shortest = path.length
                     context.improved(shortest)
-                    if searched <= target_length:
+                    if last_length <= target_length:
                         break
                 else:
                     settings = replace(settings, resolution=finer_resolution(settings.resolution))
                     attempt = attempt + 1
-                    searched = np.inf
+                    last_length = np.inf
                     search = _Search(context, start_goal, self, settings, attempt)
             if context.remaining <= 0:
                 break

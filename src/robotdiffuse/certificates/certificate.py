@@ -42,7 +42,7 @@ class Certificate(MotionProof):
             at_most: Largest tolerances that the proof may use; None: the validator's default tolerances.
 
         Returns:
-            What was checked, and each requirement that is not proved.
+            Each difference from the proof, and each requirement that is not proved.
 
         Raises:
             InputError: If there is no problem, and for shapes that certificates do not support.
@@ -171,7 +171,7 @@ def _claim_proof(k: int, entry: dict[str, Any]) -> StretchProof:
 
 
 def _named_bounds(_: str, rows: list[Any]) -> tuple[tuple[str, float], ...]:
-    return tuple((str(name), converted(str(name), Number, limit)) for name, limit in rows)
+    return tuple((str(name), converted(str(name), Number, bound)) for name, bound in rows)
 
 
 def _vector(name: str, value: object) -> ndarray:

@@ -62,8 +62,8 @@ class Findings:
 def check(
     certificate: MotionProof, problem: Problem | None = None, at_most: Tolerances = VALIDATOR
 ) -> Findings:
-    """Check a proof for a problem; None: the problem in the certificate. Its tolerances must not exceed
-    `at_most`.
+    """Check a proof for a problem; None: the problem in the certificate. The certificate's tolerances must
+    not exceed `at_most`.
 
     Robot, scene and motion must have the content that was certified. The motion must keep the limits along
     the cubics that join its rows, begin at the start, stop at each waypoint or pass it within its blend, and
@@ -182,11 +182,11 @@ def _bound_errors(
             more = f" ({len(off) - 1} more)" if len(off) > 1 else ""
             yield f"proof: {quantity} of {_place(proof, i)} is {right[i]:.6f} m, not {written[i]:.6f} m{more}"
     margin = bounds.clearance - bounds.displacement
-    for quantity, marked in kinds.items():
-        stated_clearance = stated[quantity]
+    for kind, marked in kinds.items():
+        stated_clearance = stated[kind]
         if not 0 < stated_clearance <= CLEARANCE_CAP:
             yield (
-                f"proof: its {quantity} clearance is {stated_clearance:g} m; it must be positive, and at "
+                f"proof: its {kind} clearance is {stated_clearance:g} m; it must be positive, and at "
                 f"most {CLEARANCE_CAP:g} m"
             )
         unproved = np.flatnonzero(marked & ~(margin >= stated_clearance - BOUND_TOLERANCE))
@@ -207,7 +207,7 @@ def _gaps(proof: StretchProof, last: float) -> Iterator[str]:
         start = stretches.start[rows]
         stop = stretches.stop[rows]
         edges = np.concatenate([[0.0], stop]), np.concatenate([start, [last]])
-        # Even a motion of one row needs a stretch; that it is missing leaves no gap between edges.
+        # A motion of one row needs a stretch too; without one, both edges are row 0, so there is no gap.
         empty = not len(rows)
         broken = np.flatnonzero((edges[0] != edges[1]) | np.append(stop < start, empty))
         if len(broken):

@@ -3,11 +3,12 @@ path constraints and torques.
 
 Path constraints: from one configuration to the next, each joint j moves by dq_j at a constant rate. The
 origin p of a frame then deviates from the chord (the straight line between its two positions) by at most an
-eighth of its largest second derivative. This derivative is at most sum_jk |dq_j dq_k| L_max(j,k), where L_k
-is an upper bound on the distance of p from the axis of joint k during the motion. The distance of a point to
-a convex body is a convex function. So along the chord, it is at most the larger of its values at the two
-ends; the deviation is added. An axis of the frame deviates from its own chord by at most (sum_j |dq_j|)² / 8.
-The angle between two rotating frames changes at most at the sum of their speeds of rotation.
+eighth of its largest second derivative. This derivative is at most sum_jk |dq_j dq_k| L_m with m = max(j, k),
+where L_m is an upper bound on the distance of p from the axis of joint m during the motion. The distance of a
+point to a convex body is a convex function. So along the chord, this distance is at most the larger of its
+values at the two ends; the deviation is added. An axis of the frame deviates from its own chord by at most
+(sum_j |dq_j|)² / 8. The angle between two rotating frames changes at most at the sum of their speeds of
+rotation.
 
 Torques are computed at samples: the rows of the motion and places between them. Between two samples,
 positions follow a cubic or a straight line, and velocities and accelerations are its derivatives.
@@ -128,8 +129,8 @@ def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> It
     """A message for each frame that is not proved to keep its constraint's speed limit along the cubics. The
     limit may be exceeded by the fraction `slack`.
 
-    A velocity deviates from linear interpolation by at most an eighth of its second derivative times the
-    square of the interval. The derivative of a position by several joints is at most the lever arm of the
+    A velocity deviates from linear interpolation by at most an eighth of its largest second derivative times
+    the square of the interval. The derivative of a position by several joints is at most the lever arm of the
     last of these joints.
     """
     linkage = Linkage(problem.robot)
@@ -247,7 +248,7 @@ def _angle_bounds(along: _FrameMotion, chord: float, *ends: Pose) -> Values:
     total_angle = float(_angles(turn[None], np.eye(3))[0])
     axis = np.linalg.eigh(turn + turn.T)[1][:, -1]
     axis = axis if _skew(turn) @ axis >= 0 else -axis  # an eigenvector's sign is arbitrary
-    if length < MIN_LINE_LENGTH:  # rotation in place: compare with its nearest orientation
+    if length < MIN_LINE_LENGTH:  # rotation in place: compare with the nearest of its orientations
         turned = along.R @ T_start[:3, :3].T
         cosines = np.trace(turned, axis1=1, axis2=2) - turned @ axis @ axis
         angles = np.clip(np.arctan2(_skew(turned) @ axis, cosines), 0.0, total_angle)
@@ -459,8 +460,8 @@ AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
 """Windows over which mean accelerations are tested [s]. The longer windows are used only if any rows are
 closer than the first window, because the tolerance of positions hides accelerations between such rows."""
 AGREEMENT = 0.5
-"""Largest difference between the acceleration of a row and those of the cubics before and after it, as a
-fraction of the joint's largest acceleration."""
+"""Largest distance of a row's acceleration from the interval between the accelerations of the cubics before
+and after the row, as a fraction of the joint's largest acceleration."""
 REST_SHARE = 0.01
 """Lower bound of the joint's largest acceleration in AGREEMENT, as a fraction of the joint's limit."""
 JUMP = 1e-6
@@ -536,7 +537,8 @@ def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
 
 def place_errors(problem: Problem, certificate: MotionProof) -> list[str]:
     """Errors that would make all other tests meaningless: joints of another robot, times that do not begin at
-    0 or do not increase, and places in the proof that are not between the rows of the motion."""
+    0 or do not increase, places in the proof that are outside the motion or given twice, and times of
+    `between` that are those of rows."""
     motion = certificate.motion
     robot = problem.robot
     if tuple(motion.joint_names) != robot.joint_names:
@@ -548,15 +550,15 @@ def place_errors(problem: Problem, certificate: MotionProof) -> list[str]:
         return ["motion: its times do not increase"]
     for name, places in (("between", certificate.between), ("looks", certificate.torque_samples)):
         if not ((places > 0) & (places < times[-1])).all() or len(np.unique(places)) < len(places):
-            return [f"motion: the places of `{name}` do not lie between its rows"]
+            return [f"motion: the places of `{name}` do not lie between its rows, each once"]
     if isinstance(motion, Trajectory) and np.isin(certificate.between, times).any():
         return ["motion: the times of `between` do not lie between its rows"]
     return []
 
 
 def cubic_jerks(robot: Robot, motion: Path | Trajectory) -> JointValues | None:
-    """The largest jerk of each joint along the cubics; None for a path, and for a trajectory whose
-    accelerations jump or differ from those of its cubics."""
+    """The largest jerk of each joint along the cubics; None for a path, for a trajectory of one row, and for
+    a trajectory whose accelerations jump or differ from those of its cubics."""
     if isinstance(motion, Path) or len(motion.times) < 2:
         return None
     cubics = cubics_of(motion)
@@ -724,8 +726,8 @@ def _rate_errors(
         if lines:
             break
     reference_speed = np.where(speed > 0, speed, np.abs(v).max(axis=0, initial=0.0))
-    off = np.abs(np.stack([v[0] - start_velocity, v[-1]]))
-    if (off > tolerances.rate_slack * reference_speed + tolerances.rest).any():
+    end_errors = np.abs(np.stack([v[0] - start_velocity, v[-1]]))
+    if (end_errors > tolerances.rate_slack * reference_speed + tolerances.rest).any():
         message = "at the problem's start_velocity, or end" if start_velocity.any() else "and end"
         yield f"motion: it does not begin {message} at rest"
 
@@ -768,8 +770,8 @@ def _excess_displacement(
 def _agreement_errors(
     robot: Robot, motion: Trajectory, cubics: Cubics, start_velocity: JointValues, acceleration_slack: ndarray
 ) -> Iterator[str]:
-    """A message for each joint with an acceleration at a row that is not close to those of the cubics before
-    and after the row."""
+    """A message for each joint with an acceleration at a row that is further than AGREEMENT from the interval
+    between those of the cubics before and after the row."""
     before = np.concatenate([cubics.start[:1], cubics.end])
     after = np.concatenate([cubics.start, cubics.end[-1:]])
     a = motion.accelerations

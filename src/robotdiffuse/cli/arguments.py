@@ -56,7 +56,7 @@ def check_workers(arguments: Namespace) -> None:
 
 
 def number(kind: type, fits: Callable[[Any], bool], what: str) -> Callable[[str], Any]:
-    """Reads a finite number."""
+    """A function that reads a finite number for which `fits` holds. what: such a number, in messages."""
 
     def read(text: str) -> Any:
         is_digits = text.isascii() and text.isdecimal()
@@ -125,5 +125,5 @@ def positives(text: str) -> list[float]:
 
 def address(text: str) -> tuple[str, int]:
     """HOST or HOST:PORT."""
-    host, colon, at = text.rpartition(":")
-    return (filled(host), port(at)) if colon else (filled(text), ROSBRIDGE_PORT)
+    host, colon, digits = text.rpartition(":")
+    return (filled(host), port(digits)) if colon else (filled(text), ROSBRIDGE_PORT)

@@ -82,7 +82,8 @@ def run_report(arguments: Namespace) -> None:
 
 
 def _write_replays(bench: Bench, parts: list[Section], file: Path) -> str | None:
-    """The name of the written file; None if there is no motion to replay."""
+    """Writes the motions of the first motion's robot. Returns the file's name; None if there is no motion to
+    replay."""
     motions = motions_to_replay(bench, parts)
     if not motions:
         return None

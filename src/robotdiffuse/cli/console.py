@@ -104,8 +104,9 @@ def progress(what: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def clearances(motion: "PlanResult | Report | Certificate", target: float | None = None) -> str:
-    """A text with the certified clearances to the scene and between links. target: the requested clearance to
-    the scene [m], which is shown too; None: it is not shown."""
+    """A text with the certified clearances to the scene and between links, or with the smallest clearance if
+    the motion has only this one. target: the requested clearance to the scene [m], shown beside the certified
+    one; None: it is not shown."""
     if motion.scene_clearance is None or motion.self_clearance is None:
         return _certified(getattr(motion, "min_clearance", None) or 0.0)
     requested = "" if target is None else f" (asked: {1e3 * target:g} mm)"

@@ -102,7 +102,7 @@ def shelf_problem(robot: str) -> Problem:
 
 
 def seen_by_camera(problem: Problem) -> Problem:
-    """The problem with one depth view in place of its scene, from behind the arm's shoulder. The floor stays
-    known."""
+    """The problem with one depth view in place of its scene, from beside the arm and behind its shoulder. The
+    floor stays known."""
     view = seen_from_beside(replace(problem, scene=Scene([FLOOR, *problem.scene.shapes])))
     return replace(problem, scene=Scene([FLOOR]), views=(view,), unknown=PREDICTED)

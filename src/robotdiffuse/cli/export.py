@@ -21,8 +21,8 @@ def run_export(arguments: Namespace) -> None:
 def validated_motion(file: str, rate: float | None = None) -> tuple[Problem, Trajectory]:
     """The problem and the motion of a result file, resampled at `rate` [Hz] if it is given.
 
-    Raises InputError if it holds no timed motion, and if the validator rejects the motion, because other
-    programs may execute it.
+    Raises InputError if the file holds no problem or no timed motion, and if the validator rejects the
+    motion, because other programs may execute it.
     """
 
     result, problem = read_solved(file)

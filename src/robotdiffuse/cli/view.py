@@ -28,8 +28,8 @@ from robotdiffuse.visualization.replay_page import GalleryEntry, write_gallery, 
 
 
 def draw(problem: Problem, result: PlanResult | None, file: Path) -> None:
-    """Draw the motion of a result in its scene, as the ending of the file says; without a motion, the start,
-    the goal and the links that collide.
+    """Draw the motion of a result in its scene, as a replay or a picture by the ending of the file; without a
+    motion, draw the start, the goal and the links that collide.
 
     For a problem with views and the policy `predicted`, the predicted obstacles are drawn too.
     """

@@ -1,5 +1,5 @@
 """Link clearances and their gradients for batches of configurations. Each entry of a batch has its own packed
-scene. In training, both are inputs of the denoiser network."""
+scene. In training, clearances and gradients are inputs of the denoiser network."""
 
 import numpy as np
 from jaxtyping import Float32
@@ -83,8 +83,8 @@ def _packed_gradients(robot, empty, floors, floor, kinds, params, q, limit, marg
 
 
 def packed_link_clearances(
-    robot: RobotArrays, scenes: PackedScenes, q: Float32[ndarray, "batch frames dof"], limit: float
-) -> Float32[ndarray, "batch frames links"]:
+    robot: RobotArrays, scenes: PackedScenes, q: Float32[ndarray, "batch waypoints dof"], limit: float
+) -> Float32[ndarray, "batch waypoints links"]:
     """Signed distances of the moving links to the obstacles and floor of the scene with the same batch index
     [m], at most `limit`.
 
@@ -96,10 +96,10 @@ def packed_link_clearances(
 def packed_clearances_and_gradients(
     robot: RobotArrays,
     scenes: PackedScenes,
-    q: Float32[ndarray, "batch frames dof"],
+    q: Float32[ndarray, "batch waypoints dof"],
     limit: float,
     margin: float,
-) -> tuple[Float32[ndarray, "batch frames links"], Float32[ndarray, "batch frames dof"]]:
+) -> tuple[Float32[ndarray, "batch waypoints links"], Float32[ndarray, "batch waypoints dof"]]:
     """`packed_link_clearances`, and the gradients that `CollisionChecker.clearances_and_gradients` returns
     [m/rad]."""
     return _packed_gradients(robot, *_arrays(scenes), q, np.float32(limit), np.float32(margin))

@@ -5,7 +5,7 @@ The cost is computed from coarse to fine, for rows of up to 16 of a link's spher
 selected whose bounding boxes are near the row's bounding sphere. Then the distances of all spheres of the row
 to these obstacles are computed at once. Last, the spheres within the margin are processed one by one. The
 gradients of a link's spheres add up to a force and a moment (a wrench), which act on the joints that move the
-link.
+link. A group is a link with its covering spheres.
 """
 
 from typing import NamedTuple
@@ -118,15 +118,15 @@ def scene_distance(scene, p, limit):
     best = limit
     gradient = _ZERO, _ZERO, _ZERO
     for k in range(len(scene.solids)):
-        d, towards = solid_distance(scene.solids[k], p)
+        d, away = solid_distance(scene.solids[k], p)
         if d < best:
             best = d
-            gradient = towards
+            gradient = away
     if len(scene.points):
-        d, towards = near_point(scene, p, best)
+        d, away = near_point(scene, p, best)
         if d < best:
             best = d
-            gradient = towards
+            gradient = away
     return best, gradient
 
 
@@ -229,13 +229,14 @@ def make_cost_workspace(dof):
 
 
 @allocation_free(fastmath=True)
-def cost_gradient_at(robot, scene, q, pairs, margin, self_margin, work, grad):
+def cost_gradient_at(robot, scene, q, pair_distances, margin, self_margin, work, grad):
     """Returns the collision cost of a configuration and adds its gradient to `grad`.
 
     The cost is the paper's hinge loss, squared. A sphere at signed distance D < S from the scene costs
     (S - D)^2 / 2, where S is `margin` [m]. Two spheres of a checked pair of links cost the same expression of
-    their distance and `self_margin` [m]. `pairs` are the clearances of the pairs at q, at most `self_margin`
-    (`lane_clearance.pair_clearances_into`). A sufficiently negative margin turns off its part of the cost.
+    their distance and `self_margin` [m]. `pair_distances` are the clearances of the pairs at q, at most
+    `self_margin` (`lane_clearance.pair_clearances_into`). A sufficiently negative margin turns off its part
+    of the cost.
     """
     frames_of(robot, q, work.frames)
     frames = work.frames
@@ -256,7 +257,7 @@ def cost_gradient_at(robot, scene, q, pairs, margin, self_margin, work, grad):
     for p in range(len(robot.pairs)):
         a = robot.pairs[p, 0]
         b = robot.pairs[p, 1]
-        if pairs[p] >= self_margin:
+        if pair_distances[p] >= self_margin:
             continue
         ia = robot.frame[a]
         ib = robot.frame[b]

@@ -171,17 +171,17 @@ def _touching_group(robot, g, frames, near, padding, scene, k, stop_at_first):
     first = robot.first_row[g]
     last = robot.first_row[g + 1]
     for row in range(first, last):
-        may_touch = near & ~hits
+        undecided = near & ~hits
         if last - first > 1:
             centers = centers_of(frames, f, robot.row_bounds, row)
             radius = robot.row_bounds[row, 3] + padding
             if k < 0:
-                may_touch &= near_points(centers, radius, scene)
+                undecided &= near_points(centers, radius, scene)
             else:
-                may_touch &= _touching(centers, radius, scene.solids[k])
-        while may_touch:
-            i = first_lane(may_touch)
-            may_touch &= may_touch - 1
+                undecided &= _touching(centers, radius, scene.solids[k])
+        while undecided:
+            i = first_lane(undecided)
+            undecided &= undecided - 1
             centers = _place_row(robot, row, frames, f, i)
             radii = load(robot.rows, row, 3) + padding
             if k < 0:
@@ -217,11 +217,11 @@ def _touching_each_other(robot, a, b, near, stop_at_first, work):
             continue
         for other_row in range(robot.first_row[b], robot.first_row[b + 1]):
             partners = centers_of(frames, robot.frame[b], bounds, other_row)
-            may_touch = near_row & ~hits
-            may_touch &= _touching_balls(centers, bounds[row, 3], partners, bounds[other_row, 3])
-            while may_touch:
-                i = first_lane(may_touch)
-                may_touch &= may_touch - 1
+            undecided = near_row & ~hits
+            undecided &= _touching_balls(centers, bounds[row, 3], partners, bounds[other_row, 3])
+            while undecided:
+                i = first_lane(undecided)
+                undecided &= undecided - 1
                 if _rows_touch(robot, row, robot.frame[a], other_row, robot.frame[b], i, work):
                     hits |= 1 << i
                     if stop_at_first:
@@ -230,14 +230,14 @@ def _touching_each_other(robot, a, b, near, stop_at_first, work):
 
 
 @allocation_free(forceinline=True)
-def _rows_touch(robot, row, f, other, g, i, work):
-    """Whether a row of spheres of frame f touches the row `other` of frame g in lane i."""
+def _rows_touch(robot, row, f, other_row, other_f, i, work):
+    """Whether a row of spheres of frame f touches the row `other_row` of frame `other_f` in lane i."""
     centers = _place_row(robot, row, work.frames, f, i)
     radius = load(robot.rows, row, 3)
     placed = work.row
-    store_vector(placed, 0, 0, _place_row(robot, other, work.frames, g, i))
+    store_vector(placed, 0, 0, _place_row(robot, other_row, work.frames, other_f, i))
     for t in range(W):
-        if _touching_balls(centers, radius + robot.rows[other, 3 * W + t], placed[0, t::W], _ZERO):
+        if _touching_balls(centers, radius + robot.rows[other_row, 3 * W + t], placed[0, t::W], _ZERO):
             return True
     return False
 

@@ -1,4 +1,5 @@
-"""Compiled lower bounds of distances between meshes, from balls around them and boxes around obstacles."""
+"""Compiled lower bounds of the distances of link meshes to obstacles and to each other, from balls around the
+meshes' pieces; and the frames of an arm."""
 
 import numpy as np
 
@@ -38,8 +39,8 @@ def scene_bounds(frames, frame, balls, solids, check):
             for o in range(obstacles):
                 R, half = solids.rotation[o], solids.half[o]
                 gap = point_to_solid(center, R, solids.middle[o], half, solids.disc[o]) - solids.rounding[o]
-                touches = len(solids.may_touch) and solids.may_touch[check, o]
-                out[i, p * obstacles + o] = np.inf if touches else gap - balls[p, 3]
+                allowed = len(solids.may_touch) and solids.may_touch[check, o]
+                out[i, p * obstacles + o] = np.inf if allowed else gap - balls[p, 3]
     return out
 
 

@@ -83,7 +83,7 @@ class Tasks(NamedTuple):
 
 
 @inner_kernel()
-def pose_at(tracks, o, time, rotation, middle):
+def pose_at(tracks, o, time, rotation, box_center):
     """Writes the pose of obstacle o at a time [s]: R_obstacle_base [3, 3] and the center of its box [3].
     Positions of its frame are interpolated linearly, orientations by slerp."""
     low = tracks.first[o]
@@ -97,7 +97,7 @@ def pose_at(tracks, o, time, rotation, middle):
     high = min(low + 1, high)
     dot = 0.0
     for k in range(3):
-        middle[k] = tracks.xyz[low, k] + share * (tracks.xyz[high, k] - tracks.xyz[low, k])
+        box_center[k] = tracks.xyz[low, k] + share * (tracks.xyz[high, k] - tracks.xyz[low, k])
     for k in range(4):
         dot += tracks.wxyz[low, k] * tracks.wxyz[high, k]
     angle = np.arccos(min(max(dot, -1.0), 1.0))
@@ -112,7 +112,7 @@ def pose_at(tracks, o, time, rotation, middle):
     z = a * tracks.wxyz[low, 3] + b * tracks.wxyz[high, 3]
     scale = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
     write_rotation(w * scale, -x * scale, -y * scale, -z * scale, rotation)
-    write(plus(rotated_back(rotation, tracks.center[o]), middle), middle)
+    write(plus(rotated_back(rotation, tracks.center[o]), box_center), box_center)
 
 
 @inner_kernel()
@@ -126,24 +126,24 @@ def speed_between(tracks, o, start, stop):
 
 
 @inner_kernel()
-def _ball_clearance(T, ball, tracks, o, rotation, middle):
+def _ball_clearance(T, ball, tracks, o, rotation, box_center):
     """Signed distance of a ball of a link to obstacle o, without the obstacle's growth [m]; inside, a lower
     bound."""
-    gap = point_to_solid(placed(T, ball), rotation, middle, tracks.half[o], tracks.disc[o])
+    gap = point_to_solid(placed(T, ball), rotation, box_center, tracks.half[o], tracks.disc[o])
     return gap - tracks.rounding[o] - ball[3]
 
 
 @inner_kernel()
-def _clearance(links, frames, link, tracks, o, rotation, middle, enough):
+def _clearance(links, frames, link, tracks, o, rotation, box_center, enough):
     """Clearance of the spheres of a link to obstacle o [m]. If it exceeds `enough`, the result may be a lower
     bound that also exceeds `enough`."""
     T = frames[links.frame[link]]
-    clearance = _ball_clearance(T, links.bounds[link], tracks, o, rotation, middle)
+    clearance = _ball_clearance(T, links.bounds[link], tracks, o, rotation, box_center)
     if clearance > enough:
         return clearance
     clearance = np.inf
     for s in range(links.first[link], links.first[link + 1]):
-        clearance = min(clearance, _ball_clearance(T, links.spheres[s], tracks, o, rotation, middle))
+        clearance = min(clearance, _ball_clearance(T, links.spheres[s], tracks, o, rotation, box_center))
     return clearance
 
 
@@ -174,15 +174,15 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
     clearance measured so far. This smallest clearance is best[0], which this function updates.
 
     Returns:
-        The smallest bound that settled a pair [m]. The tasks that are left to the exact meshes, one pair
-        each, as (start, stop, link, obstacle, loss): `loss` bounds how much clearance is lost from the middle
-        of the interval to either end [m]. In the middle the link's spheres are at most `least` from the
-        obstacle, or the interval was halved MAX_HALVINGS times.
+        The smallest bound that settled a pair, at most CLEARANCE_CAP [m]. The tasks that are left to the
+        exact meshes, one pair each, as (start, stop, link, obstacle, loss): `loss` bounds how much clearance
+        is lost from the middle of the interval to either end [m]. In the middle, the link's spheres are at
+        most `least` from the obstacle, or the interval was halved MAX_HALVINGS times.
     """
     dof = q.shape[1]
     count = len(links.frame)
     obstacles = len(tracks.growth)
-    # the motion and the travel of its joints; a place on both is a time
+    # the motion and the travel of its joints, both over time
     motion = Motion(q, times)
     joint_travel = Motion(cumulative_motion(q), times)
     frames = base_frames(dof)
@@ -191,7 +191,7 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
     travel_in_middle = np.empty(dof)
     travel_at_stop = np.empty(dof)
     rotation = np.empty((3, 3))
-    place = np.empty(3)
+    box_center = np.empty(3)
     travel = np.empty(count)
     starts = np.empty(MAX_HALVINGS + 2)
     stops = np.empty(MAX_HALVINGS + 2)
@@ -232,7 +232,7 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
                     if not pairs[size, link, o]:
                         continue
                     if not is_posed:
-                        pose_at(tracks, o, time, rotation, place)
+                        pose_at(tracks, o, time, rotation, box_center)
                         obstacle_travel = speed_between(tracks, o, start, stop) * half_duration
                         is_posed = True
                     inflation = tracks.growth[o] * max(time, 0.0)
@@ -240,7 +240,7 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
                     required = max(least, tightness * best[0])
                     cutoff = inflation + clearance_loss + max(required, best[0] if tightness > 0 else 0.0)
                     clearance = (
-                        _clearance(links, frames, link, tracks, o, rotation, place, cutoff) - inflation
+                        _clearance(links, frames, link, tracks, o, rotation, box_center, cutoff) - inflation
                     )
                     clearance = min(clearance, CLEARANCE_CAP + clearance_loss)
                     if clearance <= least or depth == MAX_HALVINGS:
@@ -275,12 +275,12 @@ def free_at_times(links, tracks, q, times, least):
     frames = base_frames(dof)
     out = np.ones((len(q), len(times)), np.bool_)
     rotations = np.empty((obstacles, len(times), 3, 3))
-    places = np.empty((obstacles, len(times), 3))
+    centers = np.empty((obstacles, len(times), 3))
     speeds = np.empty(obstacles)
     for o in range(obstacles):
         speeds[o] = speed_between(tracks, o, times[0], times[-1]) + tracks.growth[o]
         for k in range(len(times)):
-            pose_at(tracks, o, times[k], rotations[o, k], places[o, k])
+            pose_at(tracks, o, times[k], rotations[o, k], centers[o, k])
     for i in range(len(q)):
         _pose_arm(links, q[i], frames)
         for link in range(count):
@@ -292,7 +292,7 @@ def free_at_times(links, tracks, q, times, least):
                         continue
                     required = least + tracks.growth[o] * max(times[k], 0.0)
                     spare = (
-                        _clearance(links, frames, link, tracks, o, rotations[o, k], places[o, k], required)
+                        _clearance(links, frames, link, tracks, o, rotations[o, k], centers[o, k], required)
                         - required
                     )
                     out[i, k] = spare >= 0
