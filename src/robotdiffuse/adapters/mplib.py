@@ -410,6 +410,6 @@ def _limited(robot: Robot, velocity: ArrayLike, acceleration: ArrayLike) -> Robo
 
 
 def _array(value: object) -> ndarray:
-    """The value as numbers; empty if it is none."""
+    """The value as an array of numbers; empty if it holds anything else."""
     array = numbers(value)
     return np.zeros(0) if array is None else array

@@ -643,7 +643,7 @@ def _stated_errors(
     what: str,
     stated: Sequence[tuple[str, float]],
     names: Sequence[str],
-    most: Iterable[float],
+    bounds: Iterable[float],
     limits: Iterable[float],
 ) -> Iterator[str]:
     """A message for each bound that differs from the bound in the proof, and for each bound that exceeds its
@@ -651,7 +651,7 @@ def _stated_errors(
     if [name for name, _ in stated] != [*names]:
         yield f"{what}: they are not those of the problem"
         return
-    for (name, written), bound, limit in zip(stated, most, limits, strict=True):
+    for (name, written), bound, limit in zip(stated, bounds, limits, strict=True):
         if not abs(bound - written) <= BOUND_TOLERANCE:
             yield f"{what}: the bound of {name} is {bound:.6f}, not {written:.6f}"
         if not bound <= limit:

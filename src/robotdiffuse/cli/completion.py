@@ -1,4 +1,4 @@
-"""The commands `robotdiffuse planner`, `schema` and `completion`: what can be named."""
+"""The commands `robotdiffuse planner`, `schema` and `completion`, which list planners, fields and words."""
 
 import json
 from argparse import ArgumentParser

@@ -19,18 +19,18 @@ from robotdiffuse.visualization.live.session import PageOptions, Session, first_
 
 def run_live(arguments: Namespace) -> NoReturn:
     options = PageOptions(**chosen(arguments, PageOptions.__dataclass_fields__))
-    number = free_port(arguments.host, arguments.port)
+    port = free_port(arguments.host, arguments.port)
     with Console(stderr=True).status("loading the robot (preparing a new URDF takes a minute)"):
         problem = first_problem(arguments.problem, arguments.robot)
-    serve_until_stopped(Page(Session(problem, options), PageServer(arguments.host, number)))
+    serve_until_stopped(Page(Session(problem, options), PageServer(arguments.host, port)))
 
 
 def show_live(arguments: Namespace, settings: ExplorerSettings) -> NoReturn:
     """Serve the page of an exploration until Ctrl-C."""
-    number = free_port(arguments.host, arguments.port)
+    port = free_port(arguments.host, arguments.port)
     problem = load_problem(arguments.problem)
     session = ExplorationSession(problem, settings, arguments.noise, arguments.seed, arguments.speed)
-    serve_until_stopped(ExplorationPage(session, PageServer(arguments.host, number)))
+    serve_until_stopped(ExplorationPage(session, PageServer(arguments.host, port)))
 
 
 def serve_until_stopped(page: LivePage) -> NoReturn:

@@ -69,9 +69,9 @@ def _scene(empty, floors, floor, kinds, params, solids, around):
 
 @kernel(nogil=True)
 def _packed_gradients(robot, empty, floors, floor, kinds, params, q, limit, margin):
-    first = np.searchsorted(robot.frame, 1)
+    fixed = np.searchsorted(robot.frame, 1)
     obstacles = kinds.shape[1] + 1
-    out = np.empty((q.shape[0], q.shape[1], len(robot.frame) - first), np.float32)
+    out = np.empty((q.shape[0], q.shape[1], len(robot.frame) - fixed), np.float32)
     gradients = np.empty(q.shape, np.float32)
     solids = np.empty((obstacles, 17), np.float32)
     around = np.empty((obstacles // W + 1, 6 * W), np.float32)

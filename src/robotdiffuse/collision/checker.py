@@ -71,7 +71,8 @@ class CollisionChecker:
         return links - self.padding, gradients
 
     def pair_clearances(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n pairs"]:
-        """Distance between the links of each checked pair [m], at most 1 m."""
+        """Signed distance between the spheres of each checked pair of links [m], at most 1 m; 1 m where the
+        spheres touch although the pair's table (`sphere_pair_tables.py`) excludes contact."""
         return lane_clearance.pair_clearances(self.robot_arrays, self._rows(q), collision_cost.CLEARANCE_CAP)
 
     def cost_gradients(
