@@ -55,7 +55,7 @@ class MPNetPlannerSettings(LearnedSettings, name="mpnet"):
     attempts: Count = 16
     """Number of paths that are planned at once (paper: 1)."""
     steps: Count = 24
-    """Largest number of steps of bidirectional neural planning between two states; a step is about 0.7 rad."""
+    """Largest number of steps, of about 0.7 rad each, of bidirectional planning between two states."""
     replanning: Natural = 10
     """The paper's N_r: how often colliding parts are replanned before the attempts are given up."""
     hybrid: bool = False
