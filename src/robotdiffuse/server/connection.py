@@ -12,7 +12,8 @@ from robotdiffuse.server.worker import failed
 
 LOG = logging.getLogger("robotdiffuse.server")
 READ_TIMEOUT = 10.0
-"""Time for a client to send a request, from its first byte [s]."""
+"""Time for a client to send a request [s], from its first byte; for the first request of a connection, from
+the connection's start."""
 WRITE_TIMEOUT = 60.0
 """Time for a client to read an answer that is waiting for it [s]."""
 REFUSED = "refused"
@@ -79,11 +80,11 @@ class Connection(H11Protocol):
             self.transport.close()
 
     def _refuse(self, code: int, message: str) -> None:
-        """Close the connection; send an error first if the answer has not begun."""
+        """Close the connection; send an error first if no answer has begun."""
         if self.transport.is_closing():
             return
-        begun = self.cycle is not None and not self.cycle.response_complete
-        if not begun:
+        in_application = self.cycle is not None and not self.cycle.response_complete
+        if not in_application:
             log_access(self.client, "-", code, 0.0)
         else:
             self.scope.setdefault("state", {})[REFUSED] = code
@@ -93,7 +94,7 @@ class Connection(H11Protocol):
             answer = failed(code, message).body
             headers = [("Content-Type", "application/json"), ("Content-Length", str(len(answer)))]
             head = h11.Response(status_code=code, headers=[*headers, ("Connection", "close")])
-            bodiless = begun and self.scope["method"] == "HEAD"
+            bodiless = in_application and self.scope["method"] == "HEAD"
             for event in (head, h11.Data(data=b"" if bodiless else answer), h11.EndOfMessage()):
                 self.transport.write(self.conn.send(event) or b"")
         self.transport.close()

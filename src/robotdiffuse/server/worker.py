@@ -38,7 +38,8 @@ from robotdiffuse.validation.validator import Verifier
 PLAN = "plan"
 VERIFY = "verify"
 TOO_LARGE = 413
-# Time until a worker is killed while it compiles code for a request, and while it loads code and weights [s].
+# Time until a worker is killed [s]: the first while it compiles code for a request, the second while it loads
+# code and weights.
 COMPILE_TIMEOUT = 300.0
 WARM_UP_TIMEOUT = 60.0
 MAX_ENTRIES = {
@@ -135,7 +136,7 @@ def _answer_of(endpoint: str, body: bytes) -> Answer:
     except MemoryError:
         limit_text = f"{_settings.max_worker_memory / MEGABYTE:.0f} MB"
         return failed(TOO_LARGE, f"the request needs more memory than a worker may use, {limit_text}")
-    except BaseException as error:  # a SystemExit of a planner would end the server's event loop
+    except BaseException as error:  # the server would raise a planner's SystemExit again, in its event loop
         traceback.print_exc(file=sys.stderr)
         return failed(500, f"{type(error).__name__}: {shortened(str(error))}")
 

@@ -36,7 +36,7 @@ MIN_MASS = 0.01
 
 
 class _Simulation:
-    """PyBullet's functions for a simulation of its own."""
+    """A simulation, with PyBullet's functions as methods."""
 
     def __init__(self) -> None:
         self._client = pybullet.connect(pybullet.DIRECT)
@@ -51,8 +51,8 @@ W = TypeVar("W", bound="World")
 class World:
     """A robot on a fixed base, and replaceable obstacles. Call `close`, or use it in a `with` statement.
 
-    Collisions are enabled for exactly the pairs that RobotDiffuse checks: links that a planned joint moves
-    against obstacles that they may not touch, and links on different frames unless they may touch.
+    Collisions are enabled for exactly the pairs that RobotDiffuse checks: a link that a planned joint moves
+    and an obstacle that the link may not touch, or two links on different frames that may not touch.
     """
 
     def __init__(self, robot: Robot, scene: Scene, moving: Sequence[MovingObstacle] = ()) -> None:
@@ -128,7 +128,7 @@ class World:
             self.bullet.removeBody(body)
         self.scene = scene
         scene_drawables = drawables(scene, moving)
-        self._moving = [drawable for drawable in scene_drawables if drawable.moving is not None]
+        self._moving_obstacles = [drawable for drawable in scene_drawables if drawable.moving is not None]
         self.obstacles = {drawable.name: self._add(drawable) for drawable in scene_drawables}
         for link, index in self.links.items():
             for name, body in self.obstacles.items():
@@ -141,13 +141,13 @@ class World:
 
     def move(self, time: float) -> None:
         """Place the moving obstacles at their poses of a time [s]; obstacles of unknown motion stay."""
-        for obstacle in self._moving:
+        for obstacle in self._moving_obstacles:
             self.bullet.resetBasePositionAndOrientation(
                 self.obstacles[obstacle.name], *_pose(obstacle.frame(time))
             )
 
     def touching(self) -> list[tuple[str, str, float]]:
-        """Contacts of the last step: link, obstacle or other link, signed distance [m]."""
+        """Contacts of the last step, each as (link, obstacle or other link, signed distance [m])."""
         links = {index: link for link, index in self.links.items()}
         obstacles = {body: name for name, body in self.obstacles.items()}
         return [
@@ -166,7 +166,7 @@ class World:
         return float(point[DISTANCE] + margins * COLLISION_MARGIN)
 
     def _add(self, drawn: Drawable) -> int:
-        """PyBullet's body of an obstacle."""
+        """Add an obstacle; returns PyBullet's index of its body."""
         shape = drawn.shape
         bullet = self.bullet
         if isinstance(shape, PointCloud):
@@ -189,7 +189,7 @@ class World:
         return bullet.createMultiBody(0.0, solid, -1, basePosition=xyz, baseOrientation=xyzw)
 
     def _mesh(self, mesh: Mesh) -> int:
-        """PyBullet's collision shape of a mesh, which may be hollow, at the origin."""
+        """PyBullet's collision shape of a mesh, in the mesh's coordinates; the mesh may be hollow."""
         key = mesh.vertices.tobytes(), mesh.faces.tobytes()
         if key not in self.mesh_shapes:
             file = Path(self._folder.name) / "obstacle.obj"
@@ -242,12 +242,14 @@ def _solid(mesh: ConvexMesh | Mesh) -> trimesh.Trimesh:
 
 
 def mass_and_center(meshes: tuple[ConvexMesh, ...]) -> tuple[float, Vector]:
-    """Mass [kg] and center of mass [m] of solids of DENSITY in the link frame.
+    """Mass [kg] of solids of DENSITY, and their center of mass in the link frame [m]. Space where two solids
+    overlap counts twice.
 
-    Overlapping solids count twice where they overlap.
+    A mass below MIN_MASS is raised to MIN_MASS, with the center at the link's origin.
     """
     solids = list(map(_solid, meshes))
-    masses = [DENSITY * abs(solid.volume) for solid in solids]  # negative if the faces point inwards
+    # a solid's `volume` is negative if its faces point inwards
+    masses = [DENSITY * abs(solid.volume) for solid in solids]
     total = float(sum(masses))
     if total < MIN_MASS:
         return MIN_MASS, np.zeros(3)

@@ -35,7 +35,7 @@ class Extremes(NamedTuple):
     """For each step, an upper bound on how far the cubic leaves the straight line between its two rows, for
     the joint with the largest bound [rad] or [m]."""
     chords: JointValues
-    """The same bound for each joint: the largest over all steps."""
+    """For each joint, a bound over all steps on how far the cubics leave these straight lines."""
     lower: Configuration
     """The least position of each joint."""
     upper: Configuration
@@ -91,7 +91,7 @@ class Cubics:
         joint_bounds = self.extremes.chords
         if chords.max(initial=0.0) <= chord:
             return times, q, joint_bounds
-        # a chord's error falls with the square of the number of parts
+        # if a step is divided, its bound falls with the square of the number of parts
         counts = np.ceil(np.sqrt(chords / chord)).astype(int)
         counts = np.maximum(counts, 1)
         step = np.repeat(np.arange(len(counts)), counts)
@@ -156,8 +156,9 @@ def _range(q, v, a, b, h, low, high):
     square = a * a - 2 * (b - a) * v / h
     if square < 0:
         return low, high
-    far = -a - np.copysign(np.sqrt(square), a)
-    for u in (2 * v / (h * far), far / (b - a)):
+    numerator = -a - np.copysign(np.sqrt(square), a)
+    # both roots of the quadratic, without cancellation
+    for u in (2 * v / (h * numerator), numerator / (b - a)):
         if 0 < u < 1:
             at = q + u * h * (v + u * h * (a / 2 + u * (b - a) / 6))
             low = min(low, at)

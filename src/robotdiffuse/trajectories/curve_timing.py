@@ -1,8 +1,8 @@
 """The fastest motions along smooth curves, such as the curves in joint space on which the tool follows a
 straight line.
 
-To keep the jerk limits, the motion is averaged over time. `timing.py` averages configurations, which cuts
-corners; here the place s on the curve is averaged, so that the motion stays on the curve.
+To keep the jerk limits, the motion is averaged over time. `speed_limits.time_line` averages configurations,
+which cuts corners; here the place s on the curve is averaged, so that the motion stays on the curve.
 """
 
 import numpy as np
@@ -68,18 +68,18 @@ def time_curve(
             controls[0] = waypoints[0]
             controls[-1] = waypoints[-1]
             clock, q, v, a = spline_rows(controls, step)
-            # factor on the time with which all limits hold
-            slower = ROUNDING_MARGIN * max(
+            # factor on the times with which all limits hold; below 1 if the motion may be faster
+            factor = ROUNDING_MARGIN * max(
                 float((np.abs(v) / velocity).max()),
                 float(np.sqrt((np.abs(a) / acceleration).max())),
                 float(np.cbrt((np.abs(np.diff(a, axis=0)) / (step * jerk)).max())),
             )
-            slower *= extra_slowdown(extra, q, v / slower, a / slower**2)
-            duration = slower * clock[-1]
+            factor *= extra_slowdown(extra, q, v / factor, a / factor**2)
+            duration = factor * clock[-1]
             shortest = min(shortest, duration)
             if duration < shortest_duration:
                 shortest_duration = duration
-                best = Trajectory(robot.joint_names, slower * clock, q, v / slower, a / slower**2)
+                best = Trajectory(robot.joint_names, factor * clock, q, v / factor, a / factor**2)
         if shortest > shortest_duration:
             break
     assert best is not None

@@ -47,14 +47,14 @@ Jerk = Annotated[float, Bound(least=MIN_JERK, infinite=True)]
 CHECKS_PER_INTERVAL = 8
 """Frame speeds and torques are checked at the ends of this many equal parts of each grid interval."""
 MIN_TORQUE_SHARE = 2e-3
-"""Smallest fraction of a torque limit that is available to motion, where gravity needs nearly all of it."""
+"""Fraction of a torque limit that a motion may always use, even where gravity needs nearly all of it."""
 LIMIT_TOLERANCE = 1e-6
 """Fraction by which a motion with a start speed may exceed the limits."""
 START_SHARES = tuple(ACCELERATION_FACTOR**k for k in range(16))
 """Fractions of the acceleration limits that are tried in turn for a motion with a start speed."""
 MAX_SHARES = 12
-"""Largest number of times that the limits at grid points are lowered for a motion with a start speed, until
-the real limits hold between grid points."""
+"""Largest number of attempts for a motion with a start speed. Each further attempt lowers the limits at
+grid points, until the real limits hold between them."""
 BRAKING_FRACTION = 0.9
 """Fraction of the possible deceleration that `stopping_distance` assumes; the remainder allows corners to be
 rounded."""
@@ -71,9 +71,9 @@ class TimingSettings(Settings, name="timing"):
     """Settings of the timing of paths."""
 
     sample_time: Annotated[float, Bound(least=1e-4, most=1.0)] = 0.004
-    """Largest time between the rows of a trajectory [s], unless it would have more than MAX_ROWS rows.
-    Without a jerk limit, each motion from stop to stop takes two of these steps longer than the fastest
-    one."""
+    """Largest time between the rows of a trajectory [s], unless a motion from stop to stop would then have
+    more than MAX_ROWS rows. Without a jerk limit, each motion from stop to stop takes two of these time steps
+    longer than the fastest one."""
     velocity_scale: Scaling = 1.0
     """Scale of the robot's velocity limits, at most 1."""
     acceleration_scale: Scaling = 1.0
@@ -82,8 +82,8 @@ class TimingSettings(Settings, name="timing"):
     """Jerk limit of every joint [rad/s³] or [m/s³]; None: the robot's own limits, see `jerk_limits`;
     infinite: no limit."""
     corner_deviation: NotNegative = 0.3
-    """How far a rounded corner may leave the path, as long as the motion is valid [rad, joint-space L2].
-    Averaging for jerk limits cuts corners by up to 0.03 more (with the Panda's limits)."""
+    """How far a rounded corner may leave the path [rad, joint-space L2]; less where the motion would not be
+    valid. Averaging for jerk limits cuts corners by up to 0.03 more (with the Panda's limits)."""
     corner_intervals: Count = 8
     """Smallest number of grid intervals in a rounded corner; a long corner has as many as a straight part of
     the same length."""
@@ -98,8 +98,8 @@ class FrameSpeedLimits(NamedTuple):
     """Limits on the speeds of frames."""
 
     speeds: Callable[[ndarray, ndarray], ndarray]
-    """Speeds of k frames [n, k] at configurations [n, dof] with joint velocities [n, dof]; scaling the
-    velocities scales the speeds [m/s]."""
+    """Speeds [m/s] of k frames, [n, k], at configurations [n, dof] with joint velocities [n, dof]. They are
+    proportional to the velocities."""
     limits: Values
     """Largest speed of each frame [k] [m/s]."""
 
@@ -129,11 +129,12 @@ def time_line(
     start_speed: float = 0.0,
     extra: ExtraLimits = NO_EXTRA_LIMITS,
 ) -> Rows:
-    """The fastest motion along a line that begins with ṡ = `start_speed` and ends at rest.
+    """The fastest motion along a line; the motion begins with ṡ = `start_speed` and ends at rest.
 
     The fastest motion without jerk limits is averaged over time, so that the jerk is constant between rows
-    and within its limits; accelerations are 0 at both ends. Raises OutOfTimeError if the deadline leaves no
-    time, and TooFastError if the motion cannot stop from its start speed.
+    and within its limits; accelerations are 0 at both ends. `extra` is applied only to motions from rest.
+    Raises OutOfTimeError if the deadline leaves no time, and TooFastError if the motion cannot stop from its
+    start speed.
     """
     if start_speed > 0:
         return _moving_start(robot, line, settings, start_speed)
@@ -147,7 +148,8 @@ def time_line(
         speeds = _fastest_speeds(line, grid, *limits, extra=extra)
         speeds = _slow_to_extra_limits(line, grid, speeds, extra)
         duration = duration_of(grid, speeds)
-        if 2 * (limits[1] / jerk).max() > duration:  # lower accelerations may then give a shorter motion
+        # the full averaging window is longer than the motion: lower accelerations shorten the window
+        if 2 * (limits[1] / jerk).max() > duration:
             share *= ACCELERATION_FACTOR
             continue
         count = row_count(duration, settings)
@@ -166,7 +168,7 @@ def time_line(
         if window == 1:
             break
     times, q, v, a = best
-    # Averaging a motion within the extra limits may exceed these limits slightly.
+    # A motion within the extra limits may exceed them slightly after the averaging.
     slower = extra_slowdown(extra, q, v, a)
     return times * slower, q, v / slower, a / slower**2
 
@@ -188,16 +190,16 @@ def _moving_start(robot: Robot, line: RoundedLine, settings: TimingSettings, sta
     step = settings.sample_time
     best = None
     direction = line.directions[0]
-    first = line.knots[1]
+    first_length = line.knots[1]
     for share in START_SHARES:
         candidate = None
         windows = jerk_windows(step, share * acceleration, jerk)
         for window in windows:
             lead = 0.5 * (window + 1) * step * start_speed
-            if lead >= first:
+            if lead >= first_length:
                 break
             widths = line.half_widths.copy()
-            widths[:1] = np.minimum(widths[:1], first - lead)
+            widths[:1] = np.minimum(widths[:1], first_length - lead)
             waypoints = np.concatenate([line.waypoints[:1] + lead * direction, line.waypoints[1:]])
             after_lead = line_with_widths(waypoints, widths)
             grid = timing_grid(after_lead, settings)
@@ -285,8 +287,9 @@ def _fastest_speeds(
     extra: ExtraLimits = NO_EXTRA_LIMITS,
 ) -> Values:
     """ṡ at each grid point of the fastest motion that keeps the limits between grid points as well. A motion
-    from rest is slowed down as a whole. For a motion with a start speed, the limits at the grid points are
-    lowered by the factor `share` until the motion keeps the real limits everywhere."""
+    from rest is slowed down as a whole. For a motion with a start speed, velocity limits at the grid points
+    are multiplied by `share`, and acceleration limits by its square, until the motion keeps the real limits
+    everywhere. Raises TooFastError if no motion does."""
     share = 1.0
     at_start = start_speed * np.abs(line(grid[:1], 1)[0])
     for _ in range(MAX_SHARES):
@@ -343,7 +346,7 @@ def derivatives_and_limits(
         no_limit = np.full(len(limits), np.inf)
         columns.append((a / limits, b / limits, no_limit, low / limits, high / limits))
     first, second, velocity, lowest, highest = (
-        np.concatenate(rows, axis=-1) for rows in zip(*columns, strict=True)
+        np.concatenate(parts, axis=-1) for parts in zip(*columns, strict=True)
     )
     return first, second, grid, velocity, lowest, highest
 

@@ -27,8 +27,8 @@ from robotdiffuse.trajectories.speed_limits import (
 from robotdiffuse.trajectories.timing_kernel import line_with_widths, rounded_line
 
 SHRINK_FACTOR = 0.5
-"""Factor by which the deviation of a corner, how far its rounding may leave the path, shrinks each time the
-rounding fails."""
+"""Factor by which the deviation of a corner (how far its rounding may leave the path) shrinks each time the
+rounding is refused; also the factor by which accelerations are lowered instead, see MAX_SLOWER_TIMINGS."""
 MIN_DEVIATION = 2e-4
 """A corner that cannot be rounded with this deviation is a stop [rad, joint-space L2]."""
 MAX_TIMINGS = 8
@@ -51,7 +51,7 @@ class Timing(NamedTuple):
     waypoints: Configurations
     """The distinct waypoints of the path."""
     deviations: Values
-    """How far the rounding of each inner waypoint leaves the path [rad, joint-space L2]; 0: a stop."""
+    """How far the rounding at each inner waypoint may leave the path [rad, joint-space L2]; 0: a stop."""
     trajectory: Trajectory
 
 
@@ -67,12 +67,12 @@ def time_parameterize(
     deviations: Values | None = None,
     stops: Sequence[int] = (),
 ) -> Timing:
-    """The fastest motion along the path, from rest to rest, within the robot's limits at every row.
+    """The fastest motion along the path, from `start_speed` to rest, within the robot's limits at every row.
 
     Corners of the path are rounded so that the motion need not stop there. If `valid` refuses the motion,
-    `free` checks the corners one by one, and a corner that is not free is rounded half as far until it is. A
-    corner becomes a stop if it is not free with a deviation of MIN_DEVIATION. All corners become stops if the
-    motion is still refused after MAX_TIMINGS timings. With stops at all corners, the rows lie on the path
+    `free` checks the corners one by one, and the deviation of a corner that is not free is halved until the
+    corner is free; if its deviation falls below MIN_DEVIATION, it becomes a stop. All corners become stops if
+    the motion is still refused after MAX_TIMINGS timings. With stops at all corners, the rows lie on the path
     itself, so a free path always has a trajectory; this trajectory is returned without validation.
 
     The jerk of motions from rest is constant between rows and within `speed_limits.jerk_limits`. A low
@@ -81,7 +81,7 @@ def time_parameterize(
     Args:
         robot: The robot.
         path: The path.
-        valid: Validates a motion.
+        valid: Whether a motion is valid.
         free: Whether a path is free of collision.
         settings: Settings of timing.
         keeps: Whether the configurations [n, dof] along a rounded corner meet a requirement that the path
@@ -101,6 +101,7 @@ def time_parameterize(
     Raises:
         InputError: If a velocity or acceleration limit of a joint is below MIN_RATE.
         OutOfTimeError: If the deadline leaves no time.
+        TooFastError: If the motion cannot stop on the first straight line from `start_speed`.
     """
     _check_limits(robot)
     rows = _distinct(path.positions)
@@ -158,7 +159,7 @@ def _shrunk(
     rounded corner, but not below `least`."""
     deviations, accepted_widths = deviations.copy(), np.zeros(len(deviations))
     while True:
-        # Two corners share a segment: if one shrinks, the other becomes wider and must be checked again.
+        # Neighboring corners share a segment: if one shrinks, the other may grow and must be checked again.
         line = rounded_line(waypoints, deviations)
         widths = line.half_widths
         unchecked = np.flatnonzero((deviations > 0) & (widths > accepted_widths * (1 + 1e-9)))
@@ -186,8 +187,8 @@ def _check_limits(robot: Robot) -> None:
 
 
 def _distinct(positions: Configurations) -> Int[ndarray, "m"]:
-    """Indices of the first row, of every row that differs from the last returned one, and of the last row.
-    Only one index if all rows are equal."""
+    """Indices of the first row and of every row that differs from the last returned one; in place of the last
+    of these rows, the last row of all. Only one index if all rows are equal."""
     if (np.linalg.norm(positions[1:] - positions[:-1], axis=1) > SAME_WAYPOINT_DISTANCE).all():
         return np.arange(len(positions))
     distinct = [0]
@@ -237,7 +238,7 @@ takes longer and gains little."""
 SPEED_FACTORS = (1.0, 0.5)
 """Fractions of the highest speed at which `StopGraph` has each motion."""
 MIN_DISTANCE = 1e-3
-"""Stops closer to each other than this are merged [rad]."""
+"""A stop that divides the path is left out if it is closer than this to another stop [rad]."""
 
 
 class Motion(NamedTuple):
@@ -269,11 +270,11 @@ class StopGraph:
         self.joint_names = robot.joint_names
         self.step = step
         self._extra = extra
-        rounded = timing.deviations
-        self.line = rounded_line(timing.waypoints, rounded)
-        self.stops = self._find_stops(rounded)
+        deviations = timing.deviations
+        self.line = rounded_line(timing.waypoints, deviations)
+        self.stops = self._find_stops(deviations)
         """The values of s along the path at which motions may stop, in order."""
-        sharp = self.line.knots[1:-1][rounded == 0]
+        sharp = self.line.knots[1:-1][deviations == 0]
         self.motions: list[Motion] = []
         for (i, low), (j, high) in combinations(enumerate(self.stops), 2):
             if not ((low < sharp) & (sharp < high)).any():  # a motion cannot pass a sharp corner
@@ -315,8 +316,9 @@ class StopGraph:
         return motions
 
     def sample(self, radii: JointValues, travel: float) -> tuple[Values, Configurations]:
-        """Values of s, including all stops, and the configurations there [n, dof]. From one to the next, no
-        point of the arm moves further than `travel` [m]. radii: from `motion_radii`."""
+        """Values of s, including all stops, and the configurations there [n, dof]. Between
+        neighboring stops, the values are equally spaced, so that on average no point of the arm moves further
+        than `travel` [m] from one configuration to the next. radii: from `motion_radii`."""
         parts = []
         for low, high in zip(self.stops[:-1], self.stops[1:], strict=True):
             samples = self.line(np.linspace(low, high, 33), 0)

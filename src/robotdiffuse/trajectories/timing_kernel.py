@@ -23,7 +23,7 @@ SLOWDOWN_CHECKS_PER_INTERVAL = 16
 joint exceeded its limit by 1.8 % where it reversed its direction."""
 # Factors on velocities and accelerations before `slowdown` compares them with limits. CURVE_MARGIN is for
 # rounded corners, where rates between the checked values of s were up to 0.025 % greater; ROUNDING_MARGIN is
-# for straight lines.
+# for straight lines. Accelerations get the square of a factor.
 CURVE_MARGIN = 1.0002
 ROUNDING_MARGIN = 1 + 1e-9
 NEGLIGIBLE_DERIVATIVE = 1e-7
@@ -43,8 +43,9 @@ stop."""
 
 
 class RoundedLine(NamedTuple):
-    """Straight lines between waypoints, with each corner rounded (blended) within a half width before and
-    after it: twice continuously differentiable, within a known distance of the polyline.
+    """Straight lines between waypoints, with each corner rounded (blended) from a half width before it to a
+    half width after it. The line is twice continuously differentiable, and within a known distance of the
+    polyline.
 
     The parameter s is the arc length of the polyline. Corner i is the waypoint w_i at s_i, with the half
     width d_i and the unit directions e before and f behind it. The blend is w_i + d_i (e u + (f - e) b(u)),
@@ -124,8 +125,8 @@ def evaluate_at(line, s, order, out):
 
 @kernel()
 def evaluate(line, s, order):
-    """q, q' or q'' (order 0, 1, 2) of a `RoundedLine` at values of s [m], as an array [m, dof]. At its end, q
-    is exactly the last waypoint."""
+    """q, q' or q'' (order 0, 1, 2) of a `RoundedLine` at m values of s, as an array [m, dof]. At the line's
+    end, q is exactly the last waypoint."""
     out = np.empty((len(s), line.waypoints.shape[1]))
     for i in range(len(s)):
         evaluate_at(line, s[i], order, out[i])
@@ -136,8 +137,8 @@ def evaluate(line, s, order):
 
 @kernel()
 def rounded_line(waypoints, deviations):
-    """The `RoundedLine` through waypoints [n, dof]. Its corners have the widest blends that do not overlap
-    and leave the polyline by at most the deviations [n - 2] [rad, joint-space L2]."""
+    """The `RoundedLine` through waypoints [n, dof]. Its corners have the widest blends that leave the
+    polyline by at most the deviations [n - 2] [rad, joint-space L2] and do not overlap."""
     n, dof = waypoints.shape
     lengths = np.empty(n - 1)
     knots = np.zeros(n)
@@ -236,12 +237,12 @@ def estimated_time(line, velocity, acceleration):
     for i in range(n - 1):
         width = grid[i + 1] - grid[i]
         u = (x[i + 1] - x[i]) / (2 * width)
-        worst_excess = 1.0  # largest ratio of a joint's acceleration to its limit
+        worst_ratio = 1.0  # largest ratio of a joint's acceleration to its limit
         for j in range(dof):
             for k in range(2):
                 joint_acceleration = abs(first[i + k, j] * u + second[i + k, j] * x[i + k])
-                worst_excess = max(worst_excess, joint_acceleration / acceleration[j])
-        duration += 2 * width / (np.sqrt(x[i]) + np.sqrt(x[i + 1])) * np.sqrt(worst_excess)
+                worst_ratio = max(worst_ratio, joint_acceleration / acceleration[j])
+        duration += 2 * width / (np.sqrt(x[i]) + np.sqrt(x[i + 1])) * np.sqrt(worst_ratio)
     return duration
 
 
@@ -265,10 +266,10 @@ def _bounds_of_next(first, second, i, width, x, max_next, lowest, highest):
     The acceleration of a joint at either end of the interval is alpha x + beta y, since u = (y - x) / (2
     width). So each limit bounds y by a linear function of x; the tightest lower and upper bound at x count.
 
-    first, second, lowest, highest: as of `controllable`. width: of the interval. max_next: greatest y.
+    first, second, lowest, highest: as in `controllable`. width: of the interval. max_next: greatest y.
 
     Returns intercept and slope of the lower bound, intercept and slope of the upper bound (not their values
-    at x, where both parts may cancel), and the greatest x that limits without influence of y allow.
+    at x, where both parts may cancel), and the greatest x by those limits that y does not influence.
     """
     high = max_next
     high_slope = 0.0
@@ -304,8 +305,8 @@ def controllable(first, second, grid, velocity, lowest, highest):
     """TOPP-RA's backward pass: the greatest ṡ² at each grid point from which the motion can reach the end, at
     rest there and without a stop before.
 
-    first, second: q' and q'' at the m grid points [m, dof]. grid: values of s [m]. velocity: limits [dof].
-    lowest, highest: limits of accelerations at the grid points [m, dof]. The result [m] is positive except at
+    first, second: q' and q'' at the m grid points [m, dof]. grid: m values of s. velocity: limits [dof].
+    lowest, highest: limits of accelerations at the grid points [m, dof]. The m results are positive except at
     the end.
     """
     n, dof = first.shape
@@ -387,9 +388,9 @@ def slowdown(line, grid, speeds, velocity, acceleration):
 
 @kernel()
 def states_at(grid, speeds, times):
-    """s and ṡ of a motion at increasing times [n], from 0 on [s]; after its end, the last s, at rest.
+    """s and ṡ of a motion at n increasing times from 0 on [s]; after the motion's end, the last s, and ṡ = 0.
 
-    grid, speeds: m values of s and ṡ there [m]; s̈ is constant between them.
+    grid, speeds: m values of s, and ṡ at each of them; s̈ is constant in between.
     """
     s = np.full(len(times), grid[-1])
     rates = np.zeros(len(times))
