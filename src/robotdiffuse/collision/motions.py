@@ -4,11 +4,12 @@ The motion certificate proves that a whole motion is free of collision, not only
 first contact. A piece of the motion is free for a link if a lower bound of the link's clearance along the
 piece is positive; otherwise the piece is split. The bound is computed from the clearance in the middle of the
 piece, the link's velocity there towards the nearest bodies, and a bound on the curvature of the motion
-(`kernels/motion_certificate.py`). For two links, motion is measured relative to the link nearer to the base,
-so only the joints between the links contribute. Clearances are first computed from the covering spheres, for
-many configurations at once (`kernels/lane_clearance.py`). Where the spheres are too coarse, separating planes
-between the convex meshes give the bound (`kernels/convex_bounds.py`). Coal computes distances to surfaces and
-point clouds, and decides whether bodies touch.
+(`kernels/motion_certificate.py`). For two links, motion is measured relative to the link nearer to the base
+(on two arms: to the frame where the arms part), so only the joints between the links contribute. Clearances
+are first computed from the covering spheres, for many configurations at once (`kernels/lane_clearance.py`).
+Where the spheres are too coarse, separating planes between the convex meshes give the bound
+(`kernels/convex_bounds.py`). Coal computes distances to surfaces and point clouds, and decides whether bodies
+touch.
 """
 
 from dataclasses import replace
@@ -62,7 +63,7 @@ CONTACT_TRAVEL_TOLERANCE = 1e-3
 DEPTH_SAMPLE_TRAVEL = 0.01
 """Motion bound between the configurations at which the depth of a contact is computed [m]."""
 DEPTH_SAMPLES = 64
-"""Largest number of these configurations for one contact."""
+"""Largest number of configurations at which the depth of one contact is computed."""
 
 
 def search_space(
@@ -71,7 +72,10 @@ def search_space(
     padding: float = 0.0,
     near_ends: Float[ndarray, "m columns"] | None = None,
 ) -> Space:
-    """The arguments of a compiled search; `resolution`, `padding` [m] and `near_ends` as in `Space`."""
+    """The arguments of a compiled search; `resolution` [m] as in `Space`.
+
+    `padding` [m] and the paddings in the last column of `near_ends` are in addition to the checker's padding.
+    """
     robot = checker.robot
     ends = np.zeros((0, robot.dof + 1)) if near_ends is None else near_ends.copy()
     ends[:, -1] += checker.padding
@@ -105,7 +109,7 @@ class Contact(NamedTuple):
     other: str
     """The obstacle or the other link."""
     at: float
-    """Waypoint index plus fraction."""
+    """Index of a waypoint plus a fraction of the segment after it."""
     depth: float
     """The greatest penetration found until the contact ends [m]; 0 for a touch."""
 
@@ -144,7 +148,7 @@ class ContinuousCollision:
         motion = Motion(q, motion_pieces.travel_along(q, self.checks.motion_radii))
         todo = motion_pieces.first_pieces(motion, self.checks, INITIAL_TRAVEL)
         best = np.full(2, CLEARANCE_CAP)  # smallest measured clearance of SCENE and of PAIR
-        certified = np.full(2, CLEARANCE_CAP)  # their smallest lower bounds along the motion
+        certified = np.full(2, CLEARANCE_CAP)  # smallest lower bound along the motion, of each of the two
         hit: tuple[float, int] | None = None  # place and check of the first contact
         while len(todo.start):
             bounds, rows, columns = kernel.rounds(
@@ -215,7 +219,7 @@ class ContinuousCollision:
         return ExactCollision(self.robot, self.scene)
 
     def _contact(self, motion: Motion, at: float, check: int) -> Contact:
-        """The contact of a check at travel `at`, with its greatest depth until link and obstacle separate."""
+        """The contact of a check at travel `at`, with its greatest depth until the two bodies separate."""
         steps = at + DEPTH_SAMPLE_TRAVEL * np.arange(DEPTH_SAMPLES)
         steps = steps[steps <= max(motion.travel[-1], at)]
         checks = np.full(len(steps), check)
@@ -225,10 +229,10 @@ class ContinuousCollision:
         separated = [i for i, name in enumerate(names) if name != partner or distances[i] > self.contact]
         episode = distances[: separated[0] if separated else len(steps)]
         depth = max(0.0, -float(episode.min(initial=0)))
-        low, share = motion_pieces.segment_at(motion.travel, at)
+        waypoint, share = motion_pieces.segment_at(motion.travel, at)
         if share == 0.0:  # the first of several equal waypoints
-            low = int(np.searchsorted(motion.travel, at))
-        return Contact(checks_of(self.robot)[check], str(partner), low + share, depth)
+            waypoint = int(np.searchsorted(motion.travel, at))
+        return Contact(checks_of(self.robot)[check], str(partner), waypoint + share, depth)
 
 
 @once_per_robot
@@ -251,8 +255,8 @@ def _arm(robot: Robot) -> Arm:
 
 @once_per_robot
 def _checks(robot: Robot) -> Checks:
-    """The checks as arrays for compiled code. Motion radii of a pair are relative to the last frame that
-    moves both links: the frame of the nearer link if both are on one chain."""
+    """The checks as arrays for compiled code. Motion radii of a pair are relative to the frame of the last
+    joint that moves both links: on one chain, the frame of the link nearer to the base."""
     groups, pairs = _groups(robot)
     covered = with_covering_spheres(robot)
     parts = hulls_of(robot)[1]
@@ -271,18 +275,20 @@ def _checks(robot: Robot) -> Checks:
         group_index = groups.get(link, -1) if partner is None else pairs.get(frozenset((link, partner)), -1)
         group_indices.append(group_index)
         nearer, farther = sorted((partner or robot.base, link), key=robot.link_frame)
-        low = robot.link_frame(nearer)
-        high = robot.link_frame(farther)
-        shared = robot.moved_by[low] & robot.moved_by[high]
+        near_frame = robot.link_frame(nearer)
+        far_frame = robot.link_frame(farther)
+        shared = robot.moved_by[near_frame] & robot.moved_by[far_frame]
         for member, joints in (
-            (nearer, robot.moved_by[low] & ~shared),
-            (farther, robot.moved_by[high] & ~shared),
+            (nearer, robot.moved_by[near_frame] & ~shared),
+            (farther, robot.moved_by[far_frame] & ~shared),
         ):
             if joints.any():
                 check_radii[k, joints] = radii[links.index(member), joints]
-        base.append(low)
+        base.append(near_frame)
         common.append(int(np.flatnonzero(shared).max(initial=-1)) + 1)
-        second.append(int(np.flatnonzero(robot.moved_by[high] & ~shared)[0]) if common[-1] != low else 0)
+        second.append(
+            int(np.flatnonzero(robot.moved_by[far_frame] & ~shared)[0]) if common[-1] != near_frame else 0
+        )
         partner_parts = range(0) if partner is None else parts[nearer]
         part_ranges.append(
             (parts[farther].start, parts[farther].stop, partner_parts.start, partner_parts.stop)

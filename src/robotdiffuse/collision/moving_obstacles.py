@@ -5,8 +5,9 @@ A time interval is proved free for a link and an obstacle if their clearance at 
 exceeds the sum of two distances: how far points of the link (`robots/motion_bounds.py`) and points of the
 obstacle can move in half of the interval. Otherwise the interval is halved. If only the maximum speed of an
 obstacle is known, the obstacle may be anywhere that it can have reached since time 0. Clearances are computed
-from the covering spheres (`kernels/moving_obstacles.py`), or from the meshes, by Coal, where the spheres
-touch. The result is a proof and does not depend on sampling.
+from the covering spheres (`kernels/moving_obstacles.py`). Where these spheres come within the distance that
+counts as contact, Coal computes the clearance from the meshes. The result is a proof and does not depend on
+sampling.
 """
 
 from collections.abc import Sequence
@@ -43,7 +44,7 @@ MIN_INTERVAL = 1e-7
 DEPTH_SAMPLE_TIME = 0.005
 """Time between the samples at which the depth of a contact is computed [s]."""
 DEPTH_SAMPLES = 200
-"""Largest number of these samples for one contact."""
+"""Largest number of samples at which the depth of one contact is computed."""
 
 
 class TimedContact(NamedTuple):
@@ -115,8 +116,8 @@ class MovingCollision:
         return TimedSweep(None, float(certified))
 
     def inflated(self, by: Float[ndarray, "obstacles"]) -> "MovingCollision":
-        """A copy for `first_unproved_time` in which each obstacle is inflated by a distance [m]. Only the
-        covering spheres' bounds use the inflation, not the exact meshes."""
+        """A copy for `first_unproved_time`, with each obstacle inflated by its entry of `by` [m]. Only bounds
+        from the covering spheres use the inflation; distances of the exact meshes do not."""
         inflated = copy(self)
         inflated.tracks = self.tracks._replace(rounding=self.tracks.rounding + by)
         return inflated
@@ -124,9 +125,9 @@ class MovingCollision:
     def first_unproved_time(
         self, times: Float[ndarray, "n"], q: Float[ndarray, "n dof"], least: float
     ) -> float | None:
-        """The first time [s] at which the covering spheres do not prove a clearance of `least` [m]; None if
-        they prove it for the whole motion. It never uses the exact meshes, so it is fast enough for searches
-        and control loops."""
+        """A time [s] until which the covering spheres prove a clearance of `least` [m]: the start of the
+        first interval for which they do not. None if they prove it for the whole motion. The exact meshes are
+        never used, so the call is fast enough for searches and control loops."""
         times = for_kernels(times)
         q = for_kernels(q)
         best = np.array([CLEARANCE_CAP])
@@ -147,8 +148,8 @@ class MovingCollision:
         return Tasks(starts, np.array([half[1] for half in halves]), pairs)
 
     def _distance(self, link: int, o: int, times: ndarray, q: ndarray, time: float) -> float:
-        """Signed distance [m] of a link's meshes to obstacle o at `time` [s], minus how far an obstacle of
-        which only the maximum speed is known can have moved by then."""
+        """Signed distance [m] of a link's meshes to obstacle o at `time` [s]. If only the obstacle's maximum
+        speed is known, the distance that it can have moved by then is subtracted."""
         obstacle = self.moving[o]
         # instead of the obstacle, the robot moves
         T_base_moved = obstacle.shape.T_base_shape @ inverse(obstacle.pose(time))
@@ -219,8 +220,8 @@ def compile_tracks(moving: Sequence[MovingObstacle]) -> Tracks:
         for obstacle, solid in zip(moving, solids, strict=True)
     ]
     # The bounding box of a mesh is aligned with the base frame, so it is rotated in the obstacle's frame;
-    # the extents are those of a larger box, aligned with the obstacle's frame, that contains it.
-    extents = [np.abs(T[:3, :3]) @ solid.half for T, solid in zip(boxes, solids, strict=True)]
+    # these are the half edges of a larger box, aligned with the obstacle's frame, that contains it.
+    half_edges = [np.abs(T[:3, :3]) @ solid.half for T, solid in zip(boxes, solids, strict=True)]
     return Tracks(
         np.cumsum([0] + [len(at) for at in times]),
         np.concatenate([np.zeros(0), *times]),
@@ -229,7 +230,7 @@ def compile_tracks(moving: Sequence[MovingObstacle]) -> Tracks:
         np.concatenate([np.zeros(0), *speeds]),
         np.array([obstacle.max_speed or 0.0 for obstacle in moving]),
         np.array([T[:3, 3] for T in boxes]).reshape(-1, 3),
-        np.array(extents).reshape(-1, 3),
+        np.array(half_edges).reshape(-1, 3),
         np.array([solid.disc for solid in solids], np.float64),
         np.array([solid.rounding for solid in solids], np.float64),
     )

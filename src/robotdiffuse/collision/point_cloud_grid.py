@@ -60,17 +60,17 @@ def _join(spheres: Float[ndarray, "n 4"], voxel: float) -> Float[ndarray, "m 4"]
     if not len(spheres):
         return NO_SPHERES
     offsets = spheres[:, :3] - spheres[:, :3].min(axis=0)
-    # Three voxel indices and a sphere's index are packed into one integer: sorting these is faster than
-    # argsort.
-    bits = len(spheres).bit_length()
-    axis = (62 - bits) // 3
-    keys = (offsets * (1 / max(voxel, float(offsets.max()) / (2**axis - 1)))).astype(np.int64)
-    key = (keys[:, 0] << (2 * axis)) | (keys[:, 1] << axis) | keys[:, 2]
-    packed = np.sort((key << bits) | np.arange(len(spheres)))
-    starts = np.flatnonzero(np.diff(packed >> bits, prepend=-1))
+    # Three voxel indices and the sphere's index are packed into one integer per sphere: sorting these
+    # integers is faster than argsort.
+    index_bits = len(spheres).bit_length()
+    axis_bits = (62 - index_bits) // 3
+    xyz = (offsets * (1 / max(voxel, float(offsets.max()) / (2**axis_bits - 1)))).astype(np.int64)
+    voxels = (xyz[:, 0] << (2 * axis_bits)) | (xyz[:, 1] << axis_bits) | xyz[:, 2]
+    packed = np.sort((voxels << index_bits) | np.arange(len(spheres)))
+    starts = np.flatnonzero(np.diff(packed >> index_bits, prepend=-1))
     if len(starts) == len(spheres):
         return spheres
-    spheres = spheres[packed & ((1 << bits) - 1)]
+    spheres = spheres[packed & ((1 << index_bits) - 1)]
     counts = np.diff(starts, append=len(spheres))
     centers = np.add.reduceat(spheres[:, :3], starts) / counts[:, None]
     offsets_from_center = spheres[:, :3] - np.repeat(centers, counts, axis=0)
@@ -90,8 +90,8 @@ def join_to_few(spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "m 4"]:
 
 
 def cover_triangles(triangles: Float[ndarray, "n 3 3"], reach: float) -> Float[ndarray, "m 4"]:
-    """Spheres, one around each piece of the triangles, that cover the surface up to POINT_RANGE beyond the
-    arm's `reach` [m]."""
+    """Spheres that cover the surface up to POINT_RANGE beyond the arm's `reach` [m]: one around each piece of
+    the triangles, merged if they are more than MAX_POINTS."""
     within = reach + float(POINT_RANGE)
     near = split(triangles, reach / 4, within)
     # bisected triangles have an area of about spacing² / 4
@@ -137,16 +137,16 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     index = index[order]
     cell = cell[order]
     first = np.asarray(np.searchsorted(cell, np.arange(int(np.prod(cells)) + 1)), np.int32)
-    # up to this distance, the grid is exact, enough to decide whether the largest sphere touches a point [m]
+    # distance up to which the grid is exact [m], enough to decide whether the largest sphere touches a point
     band = np.float32(max(radius + float(radii.max()) + 1e-3, 2 * float(voxel)))
     # runs of points in the same voxel
     voxels = _flat(index, shape)
     starts = np.flatnonzero(np.diff(voxels, prepend=-1))
     run = np.full(int(np.prod(shape)), -1, np.int32)
     run[voxels[starts]] = np.arange(len(starts))
-    ends = np.append(starts, len(points)).astype(np.int32)
+    run_starts = np.append(starts, len(points)).astype(np.int32)
     sizes = tuple(shape.tolist())
-    grid, nearest = make_grid(points, ends, run, low, voxel, sizes, band, np.float32(exact_distance))
+    grid, nearest = make_grid(points, run_starts, run, low, voxel, sizes, band, np.float32(exact_distance))
     frame = [*low, voxel, 2 * voxel, radii.max(), radii.min(), band, *shape, *cells]
     return PointGrid(
         points, by_sixteen(points, points[-1:]), first, grid, nearest, np.array(frame, np.float32)

@@ -159,9 +159,9 @@ def rows(
 
 
 def points(owner: str, name: str, value: object) -> ndarray:
-    """The value as n x 3 coordinates within ±MAX_COORDINATE [m].
+    """The value as n x 3 coordinates within ±MAX_COORDINATE [m]; n may be 0.
 
-    Raises InputError, naming the first wrong row, for anything else.
+    Raises InputError, naming owner.name or its first wrong row, for anything else.
     """
     array = numbers(value)
     if array is not None and array.size == 0:
@@ -187,7 +187,8 @@ def positive(owner: str, name: str, value: object) -> float:
 def unit_quaternion(owner: str, value: object, name: str = "wxyz") -> ndarray:
     """The quaternion scaled to length 1. If its length is 1 already, its numbers are not changed at all.
 
-    Raises InputError, naming owner.name, unless it is four finite numbers that are not all zero.
+    Raises InputError, naming owner.name, unless it is four numbers within ±MAX_COORDINATE, of a length of at
+    least 1e-6.
     """
     wxyz = vector(owner, name, value, 4)
     norm = np.linalg.norm(wxyz)
@@ -199,8 +200,8 @@ def unit_quaternion(owner: str, value: object, name: str = "wxyz") -> ndarray:
 def rigid_transform(what: str, value: object, slack: float = RIGID_SLACK) -> ndarray:
     """The value as a 4 x 4 pose, with the last row set to exactly 0 0 0 1.
 
-    Raises InputError, naming `what`, for other shapes, and if an entry of R R^T or of the last row is off by
-    more than `slack`.
+    Raises InputError, naming `what`, for other shapes, for numbers beyond ±MAX_COORDINATE, for a reflection,
+    and if an entry of R R^T or of the last row is off by more than `slack`.
     """
     T = numbers(value)
     if T is None or T.shape != (4, 4) or not within(T):
@@ -227,7 +228,7 @@ MAX_NUMBERS = 8
 MAX_ENTRIES = 3
 """`short` shows a tuple or list of more entries than this by the number of its entries."""
 MAX_TEXT = 200
-"""Longest text of a value [characters]."""
+"""Longest text that `one_line` returns [characters]."""
 
 
 def one_line(value: Any) -> str:

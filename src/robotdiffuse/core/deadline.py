@@ -7,7 +7,7 @@ from contextvars import ContextVar
 
 LONG = 0.2
 """A step shorter than this [s] begins as long as any time is left. Timing (the time parameterization) may
-exceed the time limit by this."""
+exceed the time limit by up to this."""
 _remaining: ContextVar[Callable[[], float] | None] = ContextVar("remaining", default=None)
 _cancel_check: ContextVar[Callable[[], None] | None] = ContextVar("cancel_check", default=None)
 # Work for which too little time is left; the words end the message "the time limit is too short ...".
@@ -65,7 +65,8 @@ def check_timing(step: str, seconds: float = 0.0) -> None:
 
 
 def check_time(step: str, seconds: float = 0.0) -> None:
-    """Raise OutOfTimeError if no time is left, or not enough for a step that takes about `seconds` [s]."""
+    """Raise OutOfTimeError if no time is left, or not enough for a step that takes about `seconds` [s]; see
+    LONG for short steps. Raises as `check_cancelled` does if the call is cancelled."""
     _check(step, seconds, PREPARING, 0.0)
 
 

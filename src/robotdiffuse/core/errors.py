@@ -18,13 +18,13 @@ MAX_NAMES = 100
 
 
 class InputError(ValueError):
-    """Bad input. The message is one line that names the field, its value and what would be right.
+    """Bad input. The first line of the message names the field, its value and what would be right.
 
     The command line prints the message and exits with status 2.
     """
 
     def __init__(self, message: str = "", listed: Iterable[str] = ()) -> None:
-        """Put the message on one line, with words of at most 300 characters.
+        """Put the message on one line, and shorten words of more than MAX_WORD characters.
 
         Args:
             message: The field, its value and what would be right.

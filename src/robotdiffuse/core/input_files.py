@@ -1,8 +1,8 @@
 """Readers of untrusted files: JSON, YAML, XML and NumPy arrays, with bounds on size and nesting.
 
 For any content and any file name these functions return a value or raise InputError, in time that grows with
-the size of the file: devices and pipes are not opened, nesting is measured before parsing, and the values
-that YAML aliases stand for are counted.
+the size of the file: devices and pipes are not opened, nesting deeper than MAX_DEPTH is refused, and the
+values that YAML aliases stand for are counted.
 """
 
 import errno
@@ -56,7 +56,7 @@ def file_name(file: object, what: str = "file") -> Path:
     """The name as a path. Raises InputError, naming `what`, for a value that is neither text nor a path, and
     for a name that is too long."""
     if not isinstance(file, str | os.PathLike):
-        raise InputError(f"{what} is {shown(file)}; it must be the name of a file, a text or a pathlib.Path")
+        raise InputError(f"{what} is {shown(file)}; it must be a file name: a text or a pathlib.Path")
     path = Path(file)
     try:
         os.lstat(path)
@@ -76,7 +76,7 @@ def known_ending(file: str | Path, what: str, endings: Collection[str]) -> str:
 
 
 def is_file(file: str | Path) -> bool:
-    """Whether a regular file of this name exists and may be read; False also for impossible names."""
+    """Whether a regular file of this name exists; False within `no_files`, and for impossible names."""
     try:
         return not _closed.get() and stat.S_ISREG(os.stat(file).st_mode)
     except (OSError, ValueError):
@@ -87,7 +87,7 @@ def input_file(file: str | Path, what: str = "", largest: int = MAX_FILE_SIZE) -
     """The path of a regular file of at most `largest` bytes; messages put `what` before its name.
 
     Raises InputError if the file is missing, not regular (a folder, a device, a pipe), too large or not
-    readable, or if no file can have this name.
+    readable, if no file can have this name, and within `no_files`.
     """
     text = str(file_name(file, what or "file"))
     named = f"{what} {text if len(text) <= MAX_SHOWN_NAME else shortened(text)}".strip()
@@ -144,7 +144,7 @@ def read_arrays(file: str | Path) -> dict[str, ndarray]:
     path = input_file(file)
     with reading(file):
         if path.suffix.lower() != ".npz":
-            with path.open("rb") as stream:  # np.load would open an archive of this name
+            with path.open("rb") as stream:  # np.load would also open an archive with this ending
                 return {"": np.lib.format.read_array(stream, allow_pickle=False)}
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
@@ -161,7 +161,7 @@ def read_arrays(file: str | Path) -> dict[str, ndarray]:
 def read_array(file: str | Path, name: str) -> ndarray:
     """The array of an .npy file; of an .npz file the array with this name, or its only array.
 
-    Raises InputError as `read_arrays` does, and if there are several arrays, but none with this name.
+    Raises InputError as `read_arrays` does, and if no array has this name, unless there is only one array.
     """
     arrays = read_arrays(file)
     if name not in arrays and len(arrays) != 1:

@@ -8,9 +8,10 @@ from weakref import WeakKeyDictionary
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
-_locks: "WeakKeyDictionary[object, Any]" = WeakKeyDictionary()
 # The locks are kept outside of their objects, since objects are copied and pickled and locks cannot be.
-_table = Lock()
+_locks: "WeakKeyDictionary[object, Any]" = WeakKeyDictionary()
+# Held while `_locks` is used
+_table_lock = Lock()
 
 
 def locked(
@@ -20,7 +21,7 @@ def locked(
 
     @wraps(method)
     def alone(self: object, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        with _table:
+        with _table_lock:
             lock = _locks.setdefault(self, RLock())
         with lock:
             return method(self, *args, **kwargs)

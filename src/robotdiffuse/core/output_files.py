@@ -57,7 +57,7 @@ def write_atomically(
 
 @contextmanager
 def replaced_folder(target: Path) -> Iterator[Path]:
-    """Yields a path in a temporary folder. At the end of the block, what was written there replaces `target`.
+    """Yields a path at which the block makes a folder. At the end of the block, the folder replaces `target`.
     If the block or the replacement fails, an existing `target` stays.
 
     Raises InputError as `write_atomically` does.
@@ -85,8 +85,9 @@ def replaced_folder(target: Path) -> Iterator[Path]:
 def check_output(file: str | Path, endings: tuple[str, ...], *inputs: str | None) -> Path:
     """The file as a path, after checking that it can be written.
 
-    Raises InputError for an ending that is not in `endings`, for a folder that is missing or read-only, and
-    for one of the files `inputs`, which it would replace.
+    Raises InputError for an ending that is not in `endings`, for the name of a folder, if the file or its
+    folder is read-only, if its folder is missing, and if it would replace one of the files `inputs`. Raises
+    the subclass OutputError for a full disk.
     """
     path = file_name(file)
     if any(name is not None and os.path.realpath(path) == os.path.realpath(name) for name in inputs):
@@ -166,8 +167,8 @@ class JsonLines:
 
 @contextmanager
 def lock_folder(out: Path) -> Iterator[None]:
-    """Make the folder and lock it; the lock is released when the process ends, even if it is killed. If the
-    folder was made here and is still empty at the end of the block, it is removed.
+    """Make the folder, and lock it during the block. The lock is also released if the process is killed. If
+    the folder was made here and is still empty at the end of the block, it is removed.
 
     Raises InputError if another process holds the lock or the folder cannot be made or written into.
     """

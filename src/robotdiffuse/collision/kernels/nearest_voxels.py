@@ -7,9 +7,9 @@ from robotdiffuse.core.kernels import allocation_free, kernel
 
 # Squared distance that stands for infinity, in lines without any points [voxels²]
 _NO_POINTS = np.int32(1 << 30)
-# Added before a position along a line is rounded down [voxels]: more than its rounding error, less than
-# the distance of such a position, a fraction with a small denominator, from the next integer unless it is
-# one
+# Added before a position along a line is rounded down [voxels]. It is more than the rounding error. Positions
+# are fractions with small denominators, so those that are not integers are farther than this below the next
+# integer.
 _ROUNDING_SLACK = 1e-6
 
 
@@ -52,11 +52,13 @@ def nearest_voxels(run):
 
 @allocation_free(fastmath=True)
 def _nearest_in_line(squares, holders, envelope, since, before, owners):
-    """Updates the squared distances and nearest values of a line from the other voxels of the line.
+    """Updates the squared distances of a line's voxels, and the values of `run` at their nearest voxels
+    (`holders`), from the other voxels of the line.
 
     Voxel s contributes the parabola before[s] + (u - s)² at position u; the new squared distance is the lower
-    envelope of all parabolas. The first `top` + 1 entries of `envelope` are the voxels on the envelope in
-    order; envelope[i] is lowest from position since[i] on. `before` and `owners` are copies of the input.
+    envelope of all parabolas. The first `top` + 1 entries of `envelope` are the voxels whose parabolas form
+    the envelope, in order; that of envelope[i] is lowest from position since[i] on. `before` and `owners` are
+    copies of the old `squares` and `holders`.
     """
     n = len(squares)
     top = -1

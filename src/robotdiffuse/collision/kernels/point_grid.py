@@ -65,8 +65,8 @@ def make_grid(points, starts, run, low, voxel, shape, band, known):
             for k in range(nz):
                 v = (i * ny + j) * nz + k
                 b = holders[i, j, k]
-                # no voxel with points is nearer, and no point is farther than `max_offset` from its voxel's
-                # center
+                # no voxel with points is nearer than that of run b, and no point is farther than `max_offset`
+                # from its voxel's center
                 lower = voxel * np.sqrt(np.float32(squares[i, j, k])) - max_offset
                 distances[v] = max(band, lower)
                 if lower >= known:
@@ -121,7 +121,8 @@ def _max_offset(points, low, voxel):
 
 @inner_kernel(fastmath=True)
 def _settle(points, starts, balls, low, voxel, shape, band, distances, nearest):
-    """Makes distances below `band` exact, and larger distances at least `band`."""
+    """Lowers the distances that are too large, so that all below `band` are exact; the others are at least
+    `band` already."""
     nx, ny, nz = shape
     # each voxel's ball of points updates the voxel centers within `band` of the ball, one row along z at a
     # time
@@ -139,44 +140,51 @@ def _settle(points, starts, balls, low, voxel, shape, band, distances, nearest):
         k0 = max(int(pz - span), 0)
         k1 = min(int(pz + span) + 1, nz)
         n = np.int32(k1 - k0)
-        zero = np.float32(k0) + _HALF
+        first_z = np.float32(k0) + _HALF
         for i in range(i0, i1):
             cx = low[0] + (np.float32(i) + _HALF) * voxel
             for j in range(j0, j1):
                 cy = low[1] + (np.float32(j) + _HALF) * voxel
-                base = (cx - x) * (cx - x) + (cy - y) * (cy - y)
-                at = (i * ny + j) * nz + k0
-                if base >= reach * reach or not _any_closer(distances, at, n, base, pz - zero, voxel, radius):
+                across = (cx - x) * (cx - x) + (cy - y) * (cy - y)
+                row = (i * ny + j) * nz + k0
+                if across >= reach * reach or not _any_closer(
+                    distances, row, n, across, pz - first_z, voxel, radius
+                ):
                     continue
                 for p in range(starts[b], starts[b + 1]):
                     dx = cx - points[p, 0]
                     dy = cy - points[p, 1]
-                    height = (points[p, 2] - low[2]) / voxel - zero
-                    _closer(distances, nearest, at, n, dx * dx + dy * dy, height, voxel, np.int32(p), band)
+                    point_z = (points[p, 2] - low[2]) / voxel - first_z
+                    _closer(distances, nearest, row, n, dx * dx + dy * dy, point_z, voxel, np.int32(p), band)
 
 
 @allocation_free(fastmath=True)
-def _any_closer(distances, at, n, base, z, voxel, radius):
-    """Whether a ball of points may contain a point that is nearer to one of n voxels in a row than the
-    voxel's current distance."""
+def _any_closer(distances, row, n, across, z, voxel, radius):
+    """Whether a ball of points may contain a point that is nearer to the center of one of n voxels than the
+    voxel's current distance.
+
+    The voxels follow each other along z; `row` is the index of the first. The ball's center is `z` voxels
+    above the center of the first voxel, and `across` is its squared distance from the line of centers [m²].
+    """
     any_closer = np.int32(0)
     for k in range(n):
         dz = (np.float32(k) - z) * voxel
-        threshold = distances[at + k] + radius
-        any_closer |= np.int32(base + dz * dz < threshold * threshold)
+        threshold = distances[row + k] + radius
+        any_closer |= np.int32(across + dz * dz < threshold * threshold)
     return any_closer
 
 
 @allocation_free(fastmath=True)
-def _closer(distances, nearest, at, n, base, z, voxel, p, band):
-    """Updates the distances and nearest points of n voxels in a row with point p."""
+def _closer(distances, nearest, row, n, across, z, voxel, p, band):
+    """Updates the distances and nearest points of n voxels with point p; `row`, `across` and `z` as in
+    `_any_closer`, for the point."""
     for k in range(n):
         dz = (np.float32(k) - z) * voxel
-        d = np.sqrt(base + dz * dz)
-        old = distances[at + k]
+        d = np.sqrt(across + dz * dz)
+        old = distances[row + k]
         closer = d < min(old, band)
-        distances[at + k] = d if closer else old
-        nearest[at + k] = p if closer else nearest[at + k]
+        distances[row + k] = d if closer else old
+        nearest[row + k] = p if closer else nearest[row + k]
 
 
 @allocation_free(forceinline=True)
@@ -201,8 +209,8 @@ def _ask_grid(centers, radius, scene):
     grid_distance = maximum(g - from_center, _ZERO)
     touch_distance = radius + (frame[5] + _SLACK)
     near = grid_distance * grid_distance + out < touch_distance * touch_distance
-    inside = (g + from_center + sqrt(out) < radius + (frame[6] - _SLACK)) & (g < band)
-    return near, near & inside
+    touching = (g + from_center + sqrt(out) < radius + (frame[6] - _SLACK)) & (g < band)
+    return near, near & touching
 
 
 @allocation_free()
@@ -221,9 +229,10 @@ def near_points(centers, radius, scene):
 
 @allocation_free()
 def _near_by_eight(centers, radius, scene):
-    """Mask of the lanes whose sphere may touch a point, from the eight voxels around its center.
+    """Mask of the lanes whose sphere may touch a point, from the eight voxels around the sphere's center.
 
-    Of the eight lower bounds, the one from the voxel on the side away from the nearest point is almost exact.
+    Each voxel gives a lower bound of the distance to the nearest point; that of the voxel on the far side of
+    the sphere's center, as seen from this point, is almost exact.
     """
     frame = scene.grid_frame
     x, y, z = times(_ONE / frame[3], minus(centers, frame))
@@ -247,8 +256,8 @@ def _near_by_eight(centers, radius, scene):
 @allocation_free()
 def touch_points(centers, radius, scene):
     """Whether a sphere in any of 16 lanes touches a point."""
-    near, inside = _ask_grid(centers, radius, scene)
-    if inside:
+    near, touching = _ask_grid(centers, radius, scene)
+    if touching:
         return True
     if near:
         near &= _near_by_eight(centers, radius, scene)
@@ -276,7 +285,8 @@ def _columns(frame, rx, ry, reach):
 
 @allocation_free(forceinline=True)
 def _in_column(scene, i, j, rx, ry, rz, reach):
-    """Index range of the points in a column's cells within `reach` [m]; empty if there are none."""
+    """Index range of the points in those cells of column (i, j) that may be within `reach` of (rx, ry, rz)
+    [m]; empty if there are none."""
     frame = scene.grid_frame
     cell = frame[4]
     my = int(frame[12])
@@ -391,10 +401,10 @@ def points_lower_bound(scene, at):
 
 @allocation_free()
 def near_point(scene, at, limit):
-    """Distance to the surface of a point near the nearest one, at most `limit` [m], and its gradient.
+    """Approximate distance to the surface of the nearest point, at most `limit` [m], and its gradient.
 
-    The point is the nearest of the eight points stored in the voxels around. The distance is too large by a
-    few millimeters at most. It is used for gradients, where an exact search would take too long.
+    It is the distance to the nearest of the points that the eight voxels around store, which is too large by
+    a few millimeters at most. It is used for gradients, where an exact search would take too long.
     """
     best = limit
     gradient = _ZERO, _ZERO, _ZERO

@@ -3,7 +3,8 @@
 Operations on lanes become SIMD instructions without relying on LLVM's vectorizer: one instruction each with
 AVX-512, two with AVX2, four with SSE or NEON. `+ - * /` take two values of lanes, or lanes and a float32,
 which is broadcast. `a < b` returns a mask: an int64 with bit i set if lane i of a is less than lane i of b.
-The compiler may contract arithmetic to fused multiply-add and assumes that no value is NaN.
+The compiler may contract arithmetic to fused multiply-add, and assumes that no value is NaN and that the sign
+of zeros does not matter.
 """
 
 import operator
@@ -31,6 +32,7 @@ _BITS = ir.IntType(64)
 _VECTOR = ir.VectorType(_FLOAT, W)
 _INTEGERS = ir.VectorType(ir.IntType(32), W)
 _EVERYWHERE = ir.Constant(_INTEGERS, [0] * W)
+# Alignment that loads, stores and gathers rely on [bytes]: that of one float32
 _ALIGN = 4
 # typed Any because callers do not pass the first argument, the context
 _operation: Any = intrinsic
@@ -227,21 +229,21 @@ def lane(_context: Any, a: Any, i: Any) -> Any:
 
 @_operation
 def lanes_with_bit(_context: Any, a: Any, bit: Any) -> Any:
-    """Mask of the lanes with an integer value that has a bit in common with `bit`."""
+    """Mask of the lanes whose value, an integer, has a bit in common with `bit`."""
 
     def codegen(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
         numbers = builder.fptosi(args[0], _INTEGERS)
         single = builder.insert_element(ir.Constant(_INTEGERS, ir.Undefined), args[1], ir.Constant(_BITS, 0))
-        mask = builder.shuffle_vector(single, ir.Constant(_INTEGERS, ir.Undefined), _EVERYWHERE)
-        masked = builder.and_(numbers, mask)
-        return _mask(builder, builder.icmp_unsigned("!=", masked, ir.Constant(_INTEGERS, [0] * W)))
+        bits = builder.shuffle_vector(single, ir.Constant(_INTEGERS, ir.Undefined), _EVERYWHERE)
+        common = builder.and_(numbers, bits)
+        return _mask(builder, builder.icmp_unsigned("!=", common, ir.Constant(_INTEGERS, [0] * W)))
 
     return (types.int64(a, bit), codegen) if a == LANES and bit == types.int32 else None
 
 
 @_operation
 def first_lane(_context: Any, mask: Any) -> Any:
-    """The first lane in a mask: the index of its lowest set bit."""
+    """The first lane in a mask that is not empty: the index of the lowest set bit."""
 
     def codegen(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
@@ -251,13 +253,14 @@ def first_lane(_context: Any, mask: Any) -> Any:
 
 @allocation_free(forceinline=True)
 def load_vector(array, row, part):
-    """The vectors of 16 lanes whose coordinates are loaded from array[row, 16 * part :]."""
+    """A vector in each of 16 lanes. From array[row, 16 * part :], 16 numbers are loaded for x, then 16 for y
+    and 16 for z."""
     return load(array, row, part), load(array, row, part + 1), load(array, row, part + 2)
 
 
 @allocation_free(forceinline=True)
 def store_vector(array, row, part, vector):
-    """Stores the vectors of 16 lanes to array[row, 16 * part :]."""
+    """Stores the vectors of 16 lanes to array[row, 16 * part :], as `load_vector` reads them."""
     store(array, row, part, vector[0])
     store(array, row, part + 1, vector[1])
     store(array, row, part + 2, vector[2])
