@@ -27,8 +27,8 @@ Contacts = Mapping[str, Sequence[str] | str]
 TIP = "tip"
 WORLD = "world"
 LINE_TIME_LIMIT = 0.3
-"""Time limit for planning a straight line [s] after a `MoveTo` step: if the line fails, the `MoveTo` step is
-planned again to another end."""
+"""Time limit for planning a straight line after a `MoveTo` step [s]. It is short, because if the line fails,
+the `MoveTo` step is planned again to another end."""
 SAME_END = 0.1
 """Two end configurations of a step are different if a joint differs by more than this [rad] or [m]."""
 
@@ -124,7 +124,7 @@ class StepsResult:
 
     @property
     def solved(self) -> bool:
-        """Whether there is a motion for each step."""
+        """Whether no step failed."""
         return self.failed is None
 
     @property
@@ -177,7 +177,7 @@ def plan_steps(
     for i, step in enumerate(steps):
         check_type(f"steps[{i}]", step, Step.__args__, "rd.MoveTo, MoveRelative, Attach or Detach")
     furthest = StepsResult((), (), space, "", 0.0)
-    retried_ends = 0
+    tried_ends = 0
 
     def motions(k: int, space: Any, q: Configuration) -> Iterator[PlanResult]:
         """Motions of step k from q, each to another goal or goal configuration; the last may be a failure."""
@@ -199,7 +199,7 @@ def plan_steps(
         result = space.plan(step.goal, q, **options)
         yield result
         if result.solved:
-            ends = _other_ends(result.problem)
+            ends = _goal_ends(result.problem)
             indices = [result.goal_index]
         while result.solved:
             ends = [(i, end) for i, end in ends if np.abs(end - result.path.positions[-1]).max() > SAME_END]
@@ -218,7 +218,7 @@ def plan_steps(
     ) -> StepsResult | None:
         """A result for all steps. The first k steps are planned already, with these `results`, and end at q.
         None if a later step fails; `furthest` then holds the failure that came after the most steps."""
-        nonlocal furthest, retried_ends
+        nonlocal furthest, tried_ends
         if k == len(steps):
             return StepsResult(tuple(steps), results, space, f"solved in {k} steps", clock() - began)
         step = steps[k]
@@ -245,18 +245,18 @@ def plan_steps(
             outcome = planned(k + 1, space, result.path.positions[-1], (*results, result))
             if outcome is not None or clock() - began > time_limit:
                 return outcome
-            retried_ends += 1
+            tried_ends += 1
 
     with located("start"):
         q = Problem(space.robot, Scene(), start, start).start
     outcome = planned(0, space, q, ())
     if outcome is None:
-        tried = f"; {retried_ends} ends of earlier steps were tried" if retried_ends > 1 else ""
+        tried = f"; {tried_ends} ends of earlier steps were tried" if tried_ends > 1 else ""
         outcome = replace(furthest, reason=furthest.reason + tried, planning_time=clock() - began)
     return outcome
 
 
-def _other_ends(problem: Problem) -> list[tuple[int, Configuration]]:
+def _goal_ends(problem: Problem) -> list[tuple[int, Configuration]]:
     """Configurations at the goals of a problem, each with its goal index (see `PlanResult.goal_index`); none
     for poses with tolerances and for poses of several links."""
     goals = problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)

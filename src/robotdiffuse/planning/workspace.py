@@ -48,7 +48,7 @@ class Workspace:
         Args:
             robot: The robot.
             tip: The link that is moved to poses; None: the tip of the robot.
-            T_world_base: Pose of the robot's base [4, 4]; None: the base is the origin of the world.
+            T_world_base: Pose of the robot's base [4, 4]; None: the base is at the origin of the world.
 
         Raises:
             InputError: For an unknown link, and a pose that is not rigid.
@@ -95,7 +95,7 @@ class Workspace:
             T_world_shape: New pose of the obstacle's own frame [4, 4].
 
         Raises:
-            InputError: For an unknown name, a pose that is not rigid, and a point cloud, which has no frame.
+            InputError: For an unknown name, a pose that is not rigid, and a point cloud, which has no pose.
         """
         shape = self._obstacle(name)
         T = self._T_base_world @ rigid_transform("T_world_shape", T_world_shape)
@@ -126,7 +126,7 @@ class Workspace:
             links: Names of links and held objects; "all"; or an empty list to allow no contact.
 
         Raises:
-            InputError: For an unknown obstacle.
+            InputError: For an unknown obstacle, and for links that are not a list of names or "all".
         """
         contacts = dict(self.scene.allowed_contacts) | {self._obstacle(obstacle).name: links}
         self.scene = Scene(
@@ -145,7 +145,8 @@ class Workspace:
             touch_links: Further links that it may touch while it is held.
 
         Raises:
-            InputError: For an unknown obstacle or link, and for a point cloud.
+            InputError: For an unknown name, q of the wrong length or out of limits, a point cloud or height
+                map, and a link that no planned joint moves.
         """
         self._obstacle(name)
         at = self._configuration(q)
@@ -161,7 +162,8 @@ class Workspace:
             q: Configuration at which it is released [dof], values by joint, or the name of a pose.
 
         Raises:
-            InputError: For an unknown name.
+            InputError: For an unknown name, q of the wrong length or out of limits, and an object that holds
+                another one.
         """
         self.scene, self.robot = self.scene.detach(name, self.robot, self._configuration(q))
 
@@ -258,8 +260,8 @@ class Workspace:
     ) -> StepsResult:
         """Plan steps such as approach, grasp, lift, carry and place. The workspace is not changed.
 
-        If a step fails, an earlier `MoveTo` step is planned again to another goal or goal configuration: the
-        last step before it that has untried ones.
+        If a step fails, the last `MoveTo` step before it that has an untried goal or goal configuration is
+        planned again to that end.
 
         Args:
             steps: `rd.MoveTo`, `rd.MoveRelative`, `rd.Attach` and `rd.Detach`, in their order.
@@ -301,9 +303,11 @@ class Workspace:
                 For a `rd.AnyGoal`, lines to the goals are tried until one is found, nearest goal first.
             start: Start configuration [dof], values by joint, or the name of a pose.
             tolerance: Largest distance of the tip from the line [m].
-            angle: Largest deviation of its orientation [rad]; None: any orientation on the way.
+            angle: Largest deviation from the evenly turning orientation [rad]; None: any orientation on the
+                way.
             speed: Largest speed of the tip [m/s]; None: only the joint limits apply.
-            time_limit: Wall time of the call [s]; the remaining time is divided equally among untried goals.
+            time_limit: Wall time of the call [s]; the remaining time is divided equally among the lines that
+                are not planned yet.
             waypoints: Poses T_world_tip [4, 4] on the way. A line leads to each, and the motion stops there.
             request: Further arguments of `rd.plan`: seed, until, ...
 

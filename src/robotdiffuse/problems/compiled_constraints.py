@@ -45,12 +45,12 @@ from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 
 MIN_SEGMENT_FRACTION = 1e-7
-"""A proof splits a segment into pieces no shorter than this fraction of the segment."""
+"""A proof does not split a piece of a segment that is at most this fraction of the segment."""
 VIOLATION_STEP = 0.01
-"""The maximum of a violation is searched for at configurations that are this far apart in joint space
+"""The maximum of a violation is searched for at configurations that are at most this far apart in joint space
 [rad]."""
 VIOLATION_STEPS = 1000
-"""Maximum number of these configurations."""
+"""Maximum number of such steps that the search for the maximum takes."""
 PROJECTION_FRACTION = 0.5
 """Projection aims at this fraction of a tolerance, to end well within the tolerance."""
 POSE_TOLERANCE = 2e-6
@@ -73,11 +73,12 @@ class ConstraintViolation:
     at: float
     """Place on the motion: waypoint index plus fraction of the segment after it; 0 for a configuration."""
     value: float
-    """Maximum value from this place until the constraint is satisfied again [m] or [rad]."""
+    """Maximum of the constrained distance or angle from this place until the constraint is satisfied again
+    [m] or [rad]."""
     limit: float
-    """Largest allowed value [m] or [rad]."""
+    """Largest allowed distance or angle [m] or [rad]."""
     angular: bool
-    """Whether value and limit are angles."""
+    """Whether `value` and `limit` are angles."""
 
     @property
     def excess(self) -> float:
@@ -197,8 +198,8 @@ class PathConstraints:
         return self._violation(row, segment + fraction, self._maximum(q, segment, fraction, row))
 
     def speeds(self, q: Configurations, rates: JointRows) -> Float[ndarray, "n limited"]:
-        """Speeds of the frames with a speed limit [m/s], one column each, at joint velocities `rates`
-        [rad/s]."""
+        """Speeds of the frames with a speed limit [m/s], one column each, at joint velocities `rates` [rad/s]
+        or [m/s]."""
         columns = [kernel.speeds(self.rows, m, for_kernels(q), for_kernels(rates)) for m in self._speed_rows]
         return np.stack(columns, axis=1) if columns else np.zeros((len(q), 0))
 
@@ -207,8 +208,8 @@ class PathConstraints:
         motion.
 
         A partial derivative of a frame's position by several joints is at most as long as the lever of the
-        last of these joints in the chain. The products of joint rates with m as their last joint sum up to
-        the product of the sums over the joints up to m, less the product of the sums up to m - 1.
+        last of these joints in the chain. The products of joint rates with j as their last joint sum up to
+        the product of the sums over the joints up to j, less the product of the sums up to j - 1.
 
         derivatives: bounds on the first three derivatives of the joint positions, for each piece.
         """

@@ -16,12 +16,12 @@ The poses at the two ends of a piece of a motion prove that the piece satisfies 
 joints move by dq at constant rates.
 
 - DISTANCE: the frame's origin p leaves the straight line between the two ends by at most an eighth of the
-  second derivative of p. This derivative is at most sum_jk |dq_j dq_k| r_max(j,k), where r_k, the lever of
-  joint k, is the distance from the joint's axis to p. Distance to a box is convex with slope 1, so it is at
-  most this deviation plus the larger value at the two ends.
+  second derivative of p. This derivative is at most sum_jk |dq_j dq_k| r[max(j, k)], where r[k], the lever
+  of joint k, is the distance from the joint's axis to p. Distance to a box is convex with slope 1, so it is
+  at most this deviation plus the larger value at the two ends.
 - CONE: the cosine of the angle is linear in the axis; the axis has a second derivative of at most
   (sum_j |dq_j|)².
-- TURN: the angle grows no faster than the frame and the interpolated orientation rotate.
+- TURN: the angle changes no faster than the frame and the interpolated orientation together rotate.
 """
 
 from typing import NamedTuple
@@ -75,7 +75,7 @@ class Rows(NamedTuple):
     inner_limit: np.ndarray
     """[m] value that projection aims for."""
     tolerance: np.ndarray
-    """[m] size of the allowed range of values; settings such as `tolerance_fraction` refer to it."""
+    """[m] size of the allowed range of values; arguments named `tolerance_fraction` are fractions of it."""
     lever_bounds: np.ndarray
     """[m, dof] for each joint of the chain, an upper bound of its lever: the distance from its axis to the
     frame's origin in meters; 1 for prismatic joints."""
@@ -99,7 +99,8 @@ class Work(NamedTuple):
     target: np.ndarray
     """[3, 4] the interpolated pose of a TURN."""
     error: np.ndarray
-    """[6] the error of a row: a rotation vector, or roll, pitch and yaw."""
+    """[6] the error of an angular row: a rotation axis (CONE), a rotation vector in the entries from 3 on
+    (TURN), or roll, pitch and yaw."""
     J: np.ndarray
     """[3 m, dof] Jacobian of the residuals e, for projection."""
     e: np.ndarray
@@ -156,7 +157,7 @@ def pose_frame(rows, m, q, work):
 
 
 @inner_kernel()
-def in_box(rows, m, T, r):
+def box_coordinate(rows, m, T, r):
     """Coordinate r of the frame's origin in the frame of the box."""
     place = rows.reference_pose[m]
     out = 0.0
@@ -255,7 +256,8 @@ def _roll_pitch_yaw(rows, m, T, angles):
 
 @inner_kernel()
 def row_value(rows, m, work):
-    """The value of row m at the pose in work.T [m] or [rad]; writes its error to work.error."""
+    """The value of row m at the pose in work.T [m] or [rad]. For an angular row, writes the error to
+    work.error."""
     if rows.row_kind[m] == CONE:
         return _cone(rows, m, work.T, work.error)
     if rows.row_kind[m] == TURN:
@@ -265,7 +267,7 @@ def row_value(rows, m, work):
     outside = 0.0
     deepest = -np.inf
     for r in range(3):
-        d = abs(in_box(rows, m, work.T, r)) - rows.half_size[m, r]
+        d = abs(box_coordinate(rows, m, work.T, r)) - rows.half_size[m, r]
         outside += max(d, 0.0) ** 2
         deepest = max(deepest, d)
     return np.sqrt(outside) + min(deepest, 0.0)
@@ -336,8 +338,8 @@ def frame_velocity(rows, m, k, work, out):
 def _unproved(rows, limits, a, b, fraction, first, second, work):
     """The first row that is not proved along a piece of the motion from a to b; -1 if all are proved.
 
-    fraction: length of the piece, relative to the motion. first, second: the rows of work.values and
-    work.levers that `evaluate` has written for the two ends of the piece.
+    fraction: length of the piece, relative to the motion. first, second: the indices in work.values and
+    work.levers at which `evaluate` has written the two ends of the piece.
     """
     for m in range(len(rows.row_kind)):
         u = work.values[first, m]
@@ -382,7 +384,7 @@ def _unproved(rows, limits, a, b, fraction, first, second, work):
 @inner_kernel()
 def proved(rows, limits, a, b, min_fraction, work):
     """The fraction of the straight motion from a to b up to which the limits are proved, and the row that is
-    not proved there; 1.0 and -1 if all are proved. min_fraction: shortest piece that is tried."""
+    not proved there; 1.0 and -1 if all are proved. min_fraction: pieces up to this fraction are not split."""
     proved_fraction = 0.0
     fraction = 1.0
     end = 0
@@ -408,7 +410,7 @@ def proved(rows, limits, a, b, min_fraction, work):
 def first_unproved(rows, limits, q, min_fraction):
     """The first place where the limits are not proved along the motion through q[n, dof].
 
-    Returns the segment, the fraction of the segment, and the row that is not proved; -1 if all are proved.
+    Returns the segment, the fraction of the segment, and the row that is not proved: -1 if all are proved.
     """
     work = make_work(rows)
     evaluate(rows, q[0], 0, work)

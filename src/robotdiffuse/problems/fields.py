@@ -135,13 +135,14 @@ def _entry_schema(kind: type[Shape] | type[Constraint]) -> Schema:
 
 
 def read_pose(where: str, data: object) -> Pose:
-    """The transform of an entry {xyz: [...], wxyz: [...]}; both fields are optional. Raises InputError for
-    anything else."""
+    """The transform of an entry {xyz: [...], wxyz: [...]}, or with rpy in place of wxyz; all fields are
+    optional. Raises InputError for anything else."""
     return pose_of(where, check_fields(where, data, (), POSE))
 
 
 def pose_of(where: str, values: dict[str, Any]) -> Pose:
-    """The transform of the fields xyz and wxyz, both optional; other fields are ignored."""
+    """The transform of the fields xyz and wxyz, both optional; other fields are ignored. `check_fields` has
+    converted rpy to wxyz."""
     xyz = vector(where, "xyz", values.get("xyz", (0.0, 0.0, 0.0)), 3)
     return transform(xyz, rotation_from_quaternion(unit_quaternion(where, values.get("wxyz", IDENTITY))))
 

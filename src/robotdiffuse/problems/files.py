@@ -79,8 +79,9 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
         The problem, with its robot loaded.
 
     Raises:
-        InputError: One line that names the file and the field, for unknown or missing fields and shapes,
-            values of the wrong type, and what `rd.Problem` does not accept.
+        InputError: For a file that cannot be read and a wrong index; and, with one line that names the file
+            and the field, for unknown or missing fields and shapes, values of the wrong type, and what
+            `rd.Problem` does not accept.
 
     Examples:
         >>> rd.load_problem("examples/ball.yaml").scene
@@ -190,7 +191,8 @@ def problem_from_record(record: object, robots: Mapping[str, Robot] | None = Non
 def save_problem(problem: Problem, file: str | Path, robot: str | None = None) -> None:
     """Write a problem to .yaml, .yml or .json (atomically), or append it as a line to .jsonl.
 
-    `robot` as in `problem_record`. Raises InputError if the file cannot be written.
+    `robot` as in `problem_record`. Raises InputError as `problem_record` does, and if the file cannot be
+    written.
     """
     file = file_name(file, "problem file")
     ending = known_ending(file, "problem file", WRITERS)
@@ -222,8 +224,8 @@ def load_motion_bench_maker(
 ) -> list[ProblemEntry]:
     """The problems of a folder with pairs of files sceneNNNN.yaml and requestNNNN.yaml, in order.
 
-    robot: None stands for the bundled robot that the scene's robot_model_name names. Joints that are not
-    planned (fingers) are locked at the values of the request's start state. An invalid problem becomes an
+    robot: None stands for the bundled or added robot that the scene's robot_model_name names. Joints that are
+    not planned (fingers) are locked at the values of the request's start state. An invalid problem becomes an
     entry with an error, e.g. if its goal is out of limits or, unless `ignore_joints`, if it has joints that
     the robot lacks. Raises InputError if the folder holds no scene.
     """

@@ -15,7 +15,7 @@ from robotdiffuse.core.errors import InputError, check_list, repeated, shown
 from robotdiffuse.core.types import GivenConfigurations, GivenPose, Pose, VectorOrNone
 
 MAX_TURN = 3.2
-"""Largest tolerance of an angle, a little more than half a turn [rad]; larger ones must be degrees."""
+"""Largest tolerance of an angle, a little more than half a turn [rad]; larger numbers can only be degrees."""
 
 
 @no_type_check

@@ -2,7 +2,7 @@
 
 A problem is trivial if the straight line from the start to a goal configuration passes the validator. It is
 hard if it is not trivial and a search solves it. JSON lines files store each problem with whether it is
-trivial and the length of the shortest known path; every benchmark reads these files.
+trivial and the length of the shortest known path; benchmarks read these files.
 """
 
 import itertools
@@ -133,7 +133,8 @@ class CaseFile:
     ) -> list[Case]:
         """The first `count` held-out problems of a family; with a search, the first `count` hard problems.
 
-        Problems that are not in the file yet are generated, validated, searched and added.
+        Problems that are not in the file yet are generated and added; with a search, problems that are
+        neither trivial nor searched yet are searched.
         """
         case_rows: list[dict[str, Any]] = []
         numbers = itertools.count()

@@ -54,9 +54,9 @@ PLANE_THICKNESS = 0.01
 MAX_PLANES = 1000
 """Maximum number of planes in a collision object; each becomes a box."""
 WIDE_REGION = 0.02
-"""A dimension of a goal region above this, twice the validator's tolerance, is noted [m]."""
+"""A goal region with a dimension above this, twice the validator's tolerance, gets a note [m]."""
 WIDE_ANGLE = 0.2618
-"""A tolerance of a goal orientation above this, the validator's tolerance, is noted [rad]."""
+"""A goal orientation with a tolerance above this, the validator's tolerance, gets a note [rad]."""
 NO_POSE = {"position": [0, 0, 0], "orientation": [0, 0, 0, 1]}
 TYPE_NUMBERS = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone", 5: "prism"}
 """Names of the types of shape_msgs/SolidPrimitive, by their numbers in messages."""
@@ -172,7 +172,8 @@ def moveit_frames(data: object, robot: Robot) -> MoveItFrames:
     """The frames of a parsed planning scene; `robot` as in `read_moveit_scene`.
 
     The scene's own frame is the frame in which robot_state.multi_dof_joint_state gives the pose of the
-    robot's root, by default `world`. Raises InputError if that field has more than one transform.
+    robot's root, by default `world`. Raises InputError if the field has more than one transform, and if
+    robot_state has attached objects.
     """
     if mapping_of(SCENE, data, "robot_state").get("attached_collision_objects"):
         raise InputError("attached_collision_objects are for the start_state of a request")
@@ -235,7 +236,7 @@ def matrix_contacts(
     not square.
     """
     matrix = mapping_of(MATRIX, matrix)
-    names, rows, default_names, defaults = (
+    names, rows, default_names, default_values = (
         list_of(f"{MATRIX}.", matrix, f"{part}entry_{column}")
         for part in ("", "default_")
         for column in ("names", "values")
@@ -251,7 +252,7 @@ def matrix_contacts(
         for name, row in zip(names, rows, strict=True)
         for partner, value in zip(names, row, strict=True)
     }
-    default = dict(zip(map(str, default_names), map(bool, defaults), strict=False))
+    default = dict(zip(map(str, default_names), map(bool, default_values), strict=False))
 
     def allowed(link: str, obstacle: str) -> bool:
         defaults = [default[name] for name in (link, obstacle) if name in default]
@@ -275,11 +276,11 @@ def _octomap(entry: dict[str, Any], frames: MoveItFrames) -> list[Shape]:
         return []
     if not message.get("binary"):
         raise InputError(f"{location} is not binary; publish it as a binary octomap (octomap_binary)")
-    numbers = vector(f"{location}.octomap", "data", data, len(data), 255.0).astype(np.int64)
+    octets = vector(f"{location}.octomap", "data", data, len(data), 255.0).astype(np.int64)
     edge = float(vector(f"{location}.octomap", "resolution", [message.get("resolution")], 1)[0])
     T = frames.of_header(location, entry) @ pose_of(f"{location}.origin", entry.get("origin") or NO_POSE)
     with located(location):
-        voxels = occupied_voxels((numbers % 256).astype(np.uint8).tobytes(), edge)
+        voxels = occupied_voxels((octets % 256).astype(np.uint8).tobytes(), edge)
         return [PointCloud(voxels, cover_radius(edge), name="octomap").moved(T)]
 
 
@@ -336,7 +337,8 @@ def _triangles(where: str, part: dict[str, Any], folder: Path) -> tuple[ndarray,
 
 
 def _cone(size: Float[ndarray, "2"], xyz: Vector, wxyz: Float[ndarray, "4"], name: str) -> Mesh:
-    """A pyramid around a cone of height and radius [m] about its z axis, with the tip at half the height."""
+    """A pyramid around a cone with size = (height, radius) [m] about the z axis; the origin is at half the
+    height."""
     from robotdiffuse.robots.fitting.convex_parts import convex_hull  # SciPy, which few problems need
 
     height, radius = size
@@ -433,8 +435,8 @@ class MoveItAttached:
     link: str
     shapes: tuple[Shape, ...]
     in_link: bool
-    """Whether the shapes are in the frame of the link; otherwise they are in the frame of the base, at the
-    start."""
+    """Whether the shapes are in the frame of the link; otherwise they are in the frame of the base, where the
+    link holds them at the start."""
     touch_links: tuple[str, ...] = ()
 
     def held_by(self, robot: Robot, start: list[float]) -> Robot:
@@ -478,9 +480,9 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
     frames: the frames of the request's scene. folder: names of mesh files are relative to it.
 
     Several joint goal constraints are alternative goals. A position and an orientation constraint of one link
-    are a pose goal at the center of the position's region; sizes and tolerances are ignored, with a note if
-    they are large. Raises
-    InputError for anything else, and for path constraints, because ignoring them would change the problem.
+    are a pose goal at the center of the position's region; the region's size and the orientation's tolerances
+    are ignored, with a note if they are large. Raises InputError for other goals, and for path constraints,
+    because ignoring them would change the problem.
     """
     data = mapping_of(REQUEST, data)
     for name in ("path_constraints", "trajectory_constraints"):

@@ -11,8 +11,8 @@ from robotdiffuse.problems.constraint_kernel import (
     DISTANCE,
     ROLL_PITCH_YAW,
     TURN,
+    box_coordinate,
     frame_velocity,
-    in_box,
     length,
     make_work,
     pose_frame,
@@ -27,7 +27,7 @@ MIN_COSINE = 0.05
 DAMPING = 1e-5
 """Damping of the steps; only squared singular values well above it are inverted."""
 MAX_STEP = 1.0
-"""Longest step of a projection [rad]."""
+"""Longest step of a projection [rad, joint-space L2]."""
 MAX_ITERATIONS = 30
 """Maximum number of steps of a projection."""
 
@@ -70,7 +70,7 @@ def _residuals(rows, limits, q, work):
         sine = length(work.error)  # of a CONE's angle
         for r in range(residuals):
             if rows.row_kind[m] == DISTANCE:
-                x = in_box(rows, m, work.T, r)
+                x = box_coordinate(rows, m, work.T, r)
                 offset = min(max(x, -rows.inner_half_size[m, r]), rows.inner_half_size[m, r]) - x
                 if offset == 0.0:
                     continue
@@ -79,10 +79,10 @@ def _residuals(rows, limits, q, work):
                 work.e[count] = ANGLE_WEIGHT * (value - rows.inner_limit[m])
             elif rows.row_kind[m] == ROLL_PITCH_YAW:
                 angle = work.error[r]
-                half_size = rows.inner_half_size[m, r]
+                inner = rows.inner_half_size[m, r]
                 if abs(angle) <= rows.half_size[m, r]:
                     continue
-                work.e[count] = ANGLE_WEIGHT * (min(max(angle, -half_size), half_size) - angle)
+                work.e[count] = ANGLE_WEIGHT * (min(max(angle, -inner), inner) - angle)
             else:
                 work.e[count] = ANGLE_WEIGHT * work.error[3 + r] * share
             # the derivatives by the joints of the chain
@@ -124,12 +124,12 @@ def step(rows, limits, q, most, work):
         return 0
     work.held[:] = False
     damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
-    # if the step moves joints beyond their limits, solve again without these joints
+    # if the step would move joints that are at a limit beyond it, solve again without these joints
     clamped_joint = False
     for k in range(dof):
-        low = q[k] <= rows.lower[k]
-        high = q[k] >= rows.upper[k]
-        if not rows.continuous[k] and ((low and work.step[k] < 0.0) or (high and work.step[k] > 0.0)):
+        at_low = q[k] <= rows.lower[k]
+        at_high = q[k] >= rows.upper[k]
+        if not rows.continuous[k] and ((at_low and work.step[k] < 0.0) or (at_high and work.step[k] > 0.0)):
             work.held[k] = clamped_joint = True
     if clamped_joint:
         damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
@@ -159,8 +159,8 @@ def project(rows, limits, q, work):
 
 @kernel(nogil=True)
 def project_each(rows, limits, q, most):
-    """Projects configurations q[n, dof] in place, in order, until `most` of them satisfy the limits; -1: all.
-    Returns which rows satisfy the limits [n]."""
+    """Projects configurations q[n, dof] in place, in order, until `most` of them satisfy the limits; -1:
+    projects all. Returns which configurations were projected and satisfy the limits [n]."""
     work = make_work(rows)
     satisfied = np.zeros(len(q), np.bool_)
     count = 0

@@ -37,17 +37,16 @@ LINE_SPREAD = np.float32(0.3)
 
 
 class Trees(NamedTuple):
-    """Tree 0 from the start and tree 1 from the goals, which may be empty. The arrays are filled in place, so
-    that a search can be continued. A lane is a group of W nodes, which the nearest-node search handles at
-    once."""
+    """Tree 0 from the start, and tree 1 from the goals; tree 1 may be empty. The arrays are filled in place,
+    so that a search can be continued. The nearest-node search handles a block of W nodes at once."""
 
     nodes: np.ndarray
     """[2, capacity, dof]"""
     columns: np.ndarray
-    """[2 * dof, capacity rounded up to full lanes] the nodes by joint, for the nearest-node search; _NOWHERE
+    """[2 * dof, capacity rounded up to full blocks] the nodes by joint, for the nearest-node search; _NOWHERE
     at unused places."""
     costs: np.ndarray
-    """[2, capacity rounded up to full lanes] path length from a root to each node [rad]. Roots are the first
+    """[2, capacity rounded up to full blocks] path length from a root to each node [rad]. Roots are the first
     nodes and have the cost 0."""
     parents: np.ndarray
     """[2, capacity] -1 for roots."""
@@ -63,11 +62,11 @@ class Trees(NamedTuple):
 def make_trees(start, goals, capacity):
     """Trees with the start and the goals as their roots; nodes have the start's data type."""
     dof = len(start)
-    lanes = (capacity + W - 1) // W * W
+    places = (capacity + W - 1) // W * W
     trees = Trees(
         np.empty((2, capacity, dof), start.dtype),
-        np.empty((2 * dof, lanes), np.float32),
-        np.zeros((2, lanes), np.float32),
+        np.empty((2 * dof, places), np.float32),
+        np.zeros((2, places), np.float32),
         np.empty((2, capacity), np.int32),
         np.empty((2, capacity), np.int32),
         np.empty((2, capacity), np.int32),
@@ -116,7 +115,7 @@ def extended_straight(space, trees, tree, near, q, longest, bound, scratch):
 def search(space, limits, trees, bound, longest, iterations, state):
     """Grow both trees for a number of iterations, or until they hold a path shorter than `bound` [rad].
 
-    This is RRT_CONNECT_PLANNER of Kuffner and LaValle, but the smaller tree grows instead of SWAP. With a
+    This is RRT_CONNECT_PLANNER of Kuffner and LaValle, but instead of SWAP, T_a is the smaller tree. With a
     finite bound, which is c_max of AORRTC, the trees grow in the space of configurations and costs. T_a is
     `tree`, T_b is `other_tree`.
 
@@ -125,7 +124,7 @@ def search(space, limits, trees, bound, longest, iterations, state):
     longest: length of the longest extension [rad, joint-space L2].
     state: of the random generator.
 
-    Returns the waypoints [n, dof] from the start to a goal; n = 0 if none was found yet.
+    Returns the waypoints [n, dof] from the start to a goal; n = 0 if no path was found yet.
     """
     nodes = trees.nodes
     costs = trees.costs
@@ -149,7 +148,7 @@ def search(space, limits, trees, bound, longest, iterations, state):
             while g < len(goals) - 1 and u > shares[g]:
                 g += 1
             sample_within(space, start, goals[g], bound, sample, state)
-            # c_rand is uniform from g_hat, the least cost-to-come, to c_max - h_hat, the least cost-to-go
+            # c_rand is uniform from g_hat to c_max - h_hat; g_hat and h_hat bound cost-to-come and cost-to-go
             g_hat = _to_roots(trees, tree, sample)
             h_hat = _to_roots(trees, other_tree, sample)
             c_rand = g_hat + random(state) * (bound - h_hat - g_hat)
@@ -201,10 +200,11 @@ def extend(space, trees, targets, longest):
     """Extend the start's tree from its nearest node towards each of the targets [n, dof], by at most
     `longest` [n] [rad]. Targets to which the motion is not free are skipped."""
     scratch = make_scratch(space, trees.nodes)
-    start = np.int64(0)  # the type of `tree` in the search: for a literal, Numba compiles the functions again
+    # the type of `tree` in the search: for a literal, Numba would compile the functions again
+    start_tree = np.int64(0)
     for n in range(len(targets)):
-        near = nearest(trees, start, targets[n], INFINITE)
-        extended_straight(space, trees, start, near, targets[n], longest[n], INFINITE, scratch)
+        near = nearest(trees, start_tree, targets[n], INFINITE)
+        extended_straight(space, trees, start_tree, near, targets[n], longest[n], INFINITE, scratch)
 
 
 @allocation_free(inline="always")
@@ -271,7 +271,7 @@ def _root_count(trees, tree):
 
 @allocation_free(fastmath=True)
 def _to_roots(trees, tree, q):
-    """g_hat of AORRTC: the distance of q to the nearest root of the tree, a lower bound of its cost [rad]."""
+    """g_hat of AORRTC: the distance of q to the nearest root of the tree, a lower bound of q's cost [rad]."""
     g_hat = np.float32(1e9)
     for r in range(_root_count(trees, tree)):
         g_hat = min(g_hat, distance(trees.nodes[tree, r], q))
@@ -288,7 +288,7 @@ def nearest(trees, tree, q, c_rand):
     bounded = c_rand < INFINITE
     best = INFINITE
     x_near = -1
-    # one lane of W nodes at a time; `nearer` has a bit for each node
+    # one block of W nodes at a time; `nearer` has a bit for each node
     for part in range((trees.sizes[tree] + W - 1) // W):
         square = _squared(trees, tree, part, q)
         if bounded:
@@ -346,7 +346,7 @@ def nearest_few(trees, tree, q, index, squares):
 
 @allocation_free(inline="always")
 def _squared(trees, tree, part, q):
-    """Squared distances from q of the W nodes in a lane."""
+    """Squared distances from q of the W nodes in a block."""
     dof = len(q)
     aside = load(trees.columns, tree * dof, part) - np.float32(q[0])
     total = aside * aside
@@ -358,8 +358,8 @@ def _squared(trees, tree, part, q):
 
 @allocation_free()
 def _lower_cost(space, trees, tree, leaf, scratch, state):
-    """Give a leaf a parent through which its cost is lower, by AORRTC's resampling of c_rand. It ends when
-    the parent stays the same, the cost does not fall or an edge collides."""
+    """Give a leaf a parent through which its cost is lower, by AORRTC's resampling of c_rand. Resampling ends
+    when the parent stays the same, the cost cannot or does not fall, or an edge collides."""
     x_new = trees.nodes[tree, leaf]
     parent = trees.parents[tree, leaf]
     c_new = trees.costs[tree, leaf]

@@ -169,7 +169,8 @@ def add_node(space, trees, goals, q, scratch, index, gaps):
     """Extend of RRT* (Karaman and Frazzoli, IJRR 2011, algorithm 6) with q as x_new.
 
     q becomes a child of the near node through which its cost is lowest, and then the parent of near nodes
-    with a lower cost through q. Returns the node of q; -1 if q cannot improve any path or cannot be reached.
+    whose cost is lower through q. Returns the node of q; -1 if q cannot improve any path, cannot be reached
+    or is a copy of a node.
 
     index, gaps: memory for the near nodes X_near and their distances.
     """
@@ -191,7 +192,7 @@ def add_node(space, trees, goals, q, scratch, index, gaps):
             if gaps[i] >= _ZERO and costs[index[i]] + gaps[i] < cost:
                 chosen = i
                 cost = costs[index[i]] + gaps[i]
-        # q cannot improve a path, or is a copy of a node
+        # no edge is free, q cannot improve a path, or q is a copy of a node
         if chosen < 0 or cost + remaining >= best or gaps[chosen] <= np.float32(1e-6):
             return -1
         parent = index[chosen]
@@ -267,7 +268,8 @@ def _grow(space, trees, goals, longest, iterations, state, scratch, index, gaps)
 
 @kernel()
 def graft(trees, goals, path, g):
-    """Add a free path from the start to a goal as a branch if it is the shortest known."""
+    """Add a free path from the start to goal g as a branch if no path to this goal is as short, and if there
+    is room in the tree."""
     if path_length(path) >= _goal_cost(trees, goals, g) * (_ONE - GAIN):
         return
     if trees.sizes[0] + len(path) >= trees.nodes.shape[1]:
@@ -283,7 +285,7 @@ def graft(trees, goals, path, g):
 @dataclass(frozen=True)
 class SharedTreeSettings(Settings, name="shared_tree_rrt_star"):
     safety_distance: NotNegative = 0.05
-    """Distance to obstacles that nodes and edges keep [m]; the default is that of the authors' enlarged
+    """Distance to obstacles that nodes and edges keep [m]; by default, as much as the authors enlarge
     obstacles."""
     step_rounds: Count = 4
     """Number of rounds without a path before the safety distance is lowered."""
@@ -299,9 +301,9 @@ class SharedTreeSettings(Settings, name="shared_tree_rrt_star"):
     """Largest number of rounds."""
     improvement: NotNegative = 0.005
     """The search ends when the best cost fell by less than this fraction in the last `patience` rounds. 0:
-    only `rounds` and the caller end a search, even if there is no path."""
+    only `rounds`, the caller or a straight path ends a search, even if there is no path."""
     patience: Count = 20
-    """Number of rounds for `improvement`."""
+    """Number of rounds over which `improvement` is measured."""
 
 
 class SharedTreeSearch:
@@ -398,7 +400,8 @@ class SharedTreeSearch:
             self._enter_step()
 
     def _enter_step(self) -> None:
-        """Set the safety distance of the step. The tree stays valid, since safety distances only fall."""
+        """Set the safety distance of the step, and add straight paths to goals that are free at this
+        distance. The tree stays valid, since safety distances only fall."""
         self.safety_distance = self._distances[self._step]
         """Distance to obstacles that paths keep, except near a start or goal that is closer to them [m]."""
         self._rounds_at_step = 0

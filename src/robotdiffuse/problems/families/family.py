@@ -145,8 +145,8 @@ def sample_until_found(
         if problem is not None:
             return problem
     raise InputError(
-        f"no free start and goal in {MAX_SCENES} scenes of {type(family).__name__} for {robot.name}: its tip "
-        f"{robot.tip} does not reach the targets of these scenes"
+        f"no free start and goal in {MAX_SCENES} scenes of {type(family).__name__} for {robot.name}; "
+        f"check that its tip {robot.tip} can reach the targets of these scenes"
     )
 
 
@@ -202,9 +202,9 @@ def between_targets(
     rng: Generator,
     settings: InverseKinematicsSettings = POSE_IK,
 ) -> SampledProblem | None:
-    """A problem from a configuration that reaches the first of two targets to up to `goals` that reach the
-    second; None if one of the targets is out of reach. The second target is drawn only once the first is
-    reached."""
+    """A problem whose start reaches the first of two targets, and whose goals, up to `goals` configurations,
+    reach the second; None if no free configuration reaches one of the targets. The second target is drawn
+    only once the first is reached."""
     reached = []
     T_base_tip = np.eye(4)
     for T_base_tip, count in zip(targets, (1, goals), strict=True):
