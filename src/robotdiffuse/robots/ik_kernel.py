@@ -18,7 +18,7 @@ PRISMATIC = 1
 CONTINUOUS = 2
 TURN = 2 * np.pi
 
-# Levenberg-Marquardt damping as a factor on the squared error; a seed is given up above the maximum
+# Levenberg-Marquardt damping as a factor on the squared error; a seed is given up above MAX_DAMPING
 INITIAL_DAMPING = 1.0
 MIN_DAMPING = 1e-9
 MAX_DAMPING = 1e3
@@ -210,7 +210,7 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
     A = np.zeros((6, 6))
     y = np.zeros(6)
     step = np.zeros(dof)
-    fixed = np.zeros(dof, dtype=np.bool_)
+    held = np.zeros(dof, dtype=np.bool_)
     trial = np.empty(dof)
     solutions = np.empty((len(known) + wanted, dof))
     solutions[: len(known)] = known
@@ -238,16 +238,16 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
                 _jacobian(T, axes, origins, kinds, joints, rotation_weight, J)
                 jacobian_outdated = False
             # hold joints that the step would push through a limit, and solve for the others again
-            fixed[:] = False
-            damped_step(J, error, damping * cost, rows, joints, fixed, A, y, step)
+            held[:] = False
+            damped_step(J, error, damping * cost, rows, joints, held, A, y, step)
             limit_hit = False
             for j in range(joints):
                 if kinds[j] != CONTINUOUS and (
                     (q[j] <= lower[j] and step[j] < 0.0) or (q[j] >= upper[j] and step[j] > 0.0)
                 ):
-                    fixed[j] = limit_hit = True
+                    held[j] = limit_hit = True
             if limit_hit:
-                damped_step(J, error, damping * cost, rows, joints, fixed, A, y, step)
+                damped_step(J, error, damping * cost, rows, joints, held, A, y, step)
             for j in range(dof):
                 trial[j] = q[j]
                 if j < joints:
@@ -278,32 +278,32 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
 
 
 @kernel()
-def follow(start, goal, steer, longest, targets, chain, parameters):
+def follow(start, goal, steer, max_step, targets, chain, parameters):
     """A path of configurations through the targets [n, 4, 4]: the start [dof], then one configuration per
     target.
 
-    Each joint moves by at most `longest` [rad] or [m] from row to row. The path ends before the first target
+    Each joint moves by at most `max_step` [rad] or [m] from row to row. The path ends before the first target
     for which no such configuration is found. The seed for a target is the previous configuration; with
-    `steer` it is moved towards the goal [dof], evenly over the remaining targets.
+    `steer`, the seed is moved towards the goal [dof], evenly over the remaining targets.
     """
     dof = len(start)
-    rows = np.empty((len(targets) + 1, dof))
+    path = np.empty((len(targets) + 1, dof))
     none = np.empty((0, dof))
     one = np.int64(1)  # for a literal, Numba would compile `solve_seeds` again
     seed = np.empty((1, dof))
-    rows[0] = start
+    path[0] = start
     for k in range(len(targets)):
-        seed[0] = rows[k]
+        seed[0] = path[k]
         if steer:
-            seed[0] += (goal - rows[k]) / (len(targets) - k)
+            seed[0] += (goal - path[k]) / (len(targets) - k)
         solutions = solve_seeds(seed, none, one, chain, targets[k], parameters)[0]
         if len(solutions) == 0:
-            return rows[: k + 1].copy()
+            return path[: k + 1].copy()
         for j in range(dof):
-            step = solutions[0, j] - rows[k, j]
+            step = solutions[0, j] - path[k, j]
             if chain.kinds[j] == CONTINUOUS:
                 step -= TURN * np.round(step / TURN)
-            if abs(step) > longest:
-                return rows[: k + 1].copy()
-            rows[k + 1, j] = rows[k, j] + step
-    return rows
+            if abs(step) > max_step:
+                return path[: k + 1].copy()
+            path[k + 1, j] = path[k, j] + step
+    return path

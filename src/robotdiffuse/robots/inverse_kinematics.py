@@ -79,11 +79,11 @@ def inverse_kinematics(
         near: A configuration that is the first seed, so that a slightly moved pose has a slightly moved first
             solution. Results are sorted by their distance from it. Joints that can turn more than once are
             turned by whole turns to be as close to it as possible.
-        rest: Values for joints of another arm, which neither move the link nor are moved by it; None: random
-            values.
+        rest: A configuration, from which joints of other arms take their values: joints that neither move
+            the link nor come after it. None: random values.
 
     Returns:
-        Configurations, one per row; no rows if the pose was not reached.
+        Configurations, one per row; no rows if the pose was not reached, or `accept` kept no solution.
 
     Raises:
         InputError: For an unknown link, a link that no planned joint moves, a count below 1, or a matrix that
@@ -149,7 +149,7 @@ def each_pose(
 
 
 def _out_of_reach(chain: IKChain, target: Pose) -> bool:
-    """Whether a pose is further from the first joint than the length of the stretched chain."""
+    """Whether a pose is farther from the first joint than the length of the stretched chain."""
     joints = chain.length
     travel = np.maximum(abs(chain.lower), abs(chain.upper))[chain.kinds == PRISMATIC].sum()
     reach = np.linalg.norm(chain.offsets[1:joints, :3, 3], axis=1).sum() + np.linalg.norm(chain.tool[:3, 3])
@@ -159,7 +159,8 @@ def _out_of_reach(chain: IKChain, target: Pose) -> bool:
 
 def ik_chain(robot: KinematicTree, frame: str, limit_margin: float) -> tuple[Int[ndarray, "k"], IKChain]:
     """Indices of the planned joints that move a link or come after it, and the chain of these joints with
-    limits narrowed by a margin [rad] or [m]. Raises InputError if no planned joint moves the link."""
+    limits narrowed by a margin [rad] or [m]. Raises InputError for an unknown link, and for a link that no
+    planned joint moves."""
     if robot.link_frame(frame) == 0:
         raise InputError(f"inverse kinematics: no planned joint moves the link {shown(frame)}")
     arm = np.flatnonzero(~on_other_arm(robot, frame))

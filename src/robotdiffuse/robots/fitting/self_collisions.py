@@ -61,7 +61,7 @@ class PairReport(NamedTuple):
     """checked, or why the pair is allowed: adjacent, always, never, default, pose or limits, as explained in
     `find_allowed_collisions`; named, if it was named when the robot was added; srdf, if an SRDF allows it."""
     colliding: float
-    """Fraction of the configurations in which convex parts of the two links collide."""
+    """Fraction of the tested configurations in which convex parts of the two links collide."""
 
 
 def find_allowed_collisions(
@@ -95,7 +95,7 @@ def find_allowed_collisions(
     poses = links.poses(q)
     default_poses = links.poses(default)
     locked_poses = links.poses(links.named({})[None])
-    named = [links.poses(links.named(pose)[None]) for pose in robot.poses.values()]
+    named_poses = [links.poses(links.named(pose)[None]) for pose in robot.poses.values()]
     adjacent = _adjacent(robot) if settings.assumptions else set[frozenset[str]]()
 
     def reason(a: str, b: str, distances: ndarray, colliding: ndarray) -> str:
@@ -112,7 +112,7 @@ def find_allowed_collisions(
                 and links.collide(locked_poses, a, b, 0)
             ):
                 return "default"
-            if any(-MAX_POSE_OVERLAP < links.mesh_distance(pose, a, b) <= 0 for pose in named):
+            if any(-MAX_POSE_OVERLAP < links.mesh_distance(pose, a, b) <= 0 for pose in named_poses):
                 return "pose"
             if colliding.mean() >= MIN_LIMITS_COLLIDING and any(
                 links.stop_explains(joint, q, colliding) for joint in _own_between(robot, a, b, 0) or ()
@@ -126,11 +126,11 @@ def find_allowed_collisions(
     reports = []
     strided = {link: T[: max(len(q) // ADJACENT_STRIDE, 1)] for link, T in poses.items()}
     for a, b in moving_pairs(robot, robot.meshes):
-        near = links.sphere_distance(strided if frozenset((a, b)) in adjacent else poses, a, b)
-        colliding = np.zeros(len(near), dtype=bool)
-        for i in np.flatnonzero(near <= 0):
+        sphere_distances = links.sphere_distance(strided if frozenset((a, b)) in adjacent else poses, a, b)
+        colliding = np.zeros(len(sphere_distances), dtype=bool)
+        for i in np.flatnonzero(sphere_distances <= 0):
             colliding[i] = links.collide(poses, a, b, int(i))
-        reports.append(PairReport((a, b), reason(a, b, near, colliding), float(colliding.mean())))
+        reports.append(PairReport((a, b), reason(a, b, sphere_distances, colliding), float(colliding.mean())))
     return tuple(reports)
 
 
@@ -142,8 +142,8 @@ def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng:
         min_distance = links.mesh_distance(links.poses(q[None], (a, b)), a, b)
         for _ in range(15):
             around = np.clip(q + step * rng.normal(size=(8, len(q))), links.lower, links.upper)
-            at = links.poses(around, (a, b))
-            distances = [links.mesh_distance(at, a, b, i) for i in range(len(around))]
+            poses_around = links.poses(around, (a, b))
+            distances = [links.mesh_distance(poses_around, a, b, i) for i in range(len(around))]
             i = int(np.argmin(distances))
             if distances[i] <= 0:
                 return True
@@ -158,13 +158,13 @@ def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng:
 def _own_between(robot: Robot, a: str, b: str, max_locked: int) -> list[Joint] | None:
     """The movable joints between two links of the arm; None if one of the links does not belong to the arm.
 
-    A link belongs to the arm if at most `max_locked` locked joints connect it to a link that planned joints
-    move, and if it is not a tool.
+    A link belongs to the arm if at most `max_locked` locked joints connect it to the base or to a link that
+    planned joints move, and if it is not a tool.
     """
 
     def own(link: str) -> bool:
-        """Whether a link belongs to the arm. Links fixed to a link of the arm belong to it, except those
-        fixed to the last link, which are tools."""
+        """Whether a link belongs to the arm. All links after the child link of an arm's last planned joint
+        count as tools."""
         planned = [joint for joint in above[link] if joint in robot.planned_joints][:1]
         carried = above[link][: above[link].index(planned[0])] if planned else above[link]
         moving = [joint for joint in carried if joint.kind in MOVING_KINDS]
@@ -318,8 +318,9 @@ def _sticking_out(
     pair: tuple[str, str],
     rows: Int[ndarray, "n"],
 ) -> dict[str, Points]:
-    """Places where convex parts of two links overlap in the configurations `rows`, by link and in the link's
-    frame [m]. Each place is listed for one of the links: the one whose true surface is farther from it."""
+    """Places where convex parts of two links overlap in the configurations with the indices `rows`, by link
+    and in the link's frame [m]. Each place is listed only for the link whose true surface is farther from the
+    place."""
     places_by_link: dict[str, list[ndarray]] = {link: [] for link in pair}
     request = coal.DistanceRequest()
     point = coal.Sphere(1e-6)

@@ -58,7 +58,7 @@ FLOOR_TOLERANCE = 0.0015
 """Spheres may always stick out this far towards the floor [m], since a link may lie on it."""
 TOLERANCE_LEVEL = np.log(1.3)
 """Tight places are grouped by tolerance for speed: within a group, tolerances differ by at most this factor
-(as a logarithm), and the lowest one applies to the whole group."""
+(as a logarithm), and the lowest of them applies to the whole group."""
 
 Planes = tuple[Points, Values, ndarray]
 
@@ -69,7 +69,7 @@ class Bounds(NamedTuple):
     tolerance: float
     """How far a sphere may stick out of the link [m]."""
     hidden: Callable[[Points], Mask] | None = None
-    """Tells which points are inside a neighboring link, so that spheres may contain them."""
+    """Tells which points are inside a neighboring link: spheres may contain such points."""
     tight: Spheres = np.zeros((0, 4))
     """Tight places: rows of x, y, z and how far spheres may stick out there [m]. Near these places, `hidden`
     does not apply."""
@@ -227,7 +227,7 @@ COARSE_CELLS = (5.0, 60_000)
 FINE_CELLS = (8.0, 150_000)
 MAX_CROWD = 10
 """If the surface would have more than this many times the allowed number of cells, larger cells are chosen
-before the small ones are computed, since these may not fit into memory."""
+at once, since the small cells may not fit into memory."""
 SMALLEST_TRIANGLE = 2e-6
 """A triangle of the surface that no single sphere contains is split down to this size [m]; a smaller one
 counts as uncovered."""
@@ -240,15 +240,16 @@ class SphereSettings:
     """How closely covering spheres follow the meshes of a link."""
 
     first_half: float = 0.015
-    """How far a sphere may stick out of a link that at most half of the joints (rounded up) move [m]."""
+    """How far a sphere may stick out of a link whose frame has an index of at most half the number of planned
+    joints, rounded up [m]. In a serial arm, at most this many joints move such a link."""
     second_half: float = 0.009
-    """How far a sphere may stick out of a link that more than half of the joints move [m]. It is smaller
-    because these links work closer to obstacles."""
+    """How far a sphere may stick out of a link on a later frame [m]. It is smaller because the outer links of
+    an arm work closer to obstacles."""
     fixed: float = 0.03
     """How far a sphere may stick out of a link that no planned joint moves [m]. It is larger because such a
     link is only checked against other links."""
     finest: float = 0.004
-    """Lower bound of these tolerances [m]."""
+    """Lower bound of the tolerances above [m]."""
     candidates: int = 1000
     """Number of candidate centers of the greedy cover."""
     rounds: int = 5
@@ -353,7 +354,7 @@ class Cells(NamedTuple):
             return Cells.of(solid, bounds, cut / np.sqrt(crowd), most)
         soup = []
         vertices = []
-        left_out = False
+        irregular = False
         planes = [stacked_planes((mesh,)) for mesh in solid.meshes]
         for k, mesh in enumerate(solid.meshes):
             triangles = mesh.vertices[mesh.faces]
@@ -367,7 +368,7 @@ class Cells(NamedTuple):
                 triangles = split(triangles, _disc(tolerances, solid.depth) / cut)
             soup.append(triangles)
             vertices.append(mesh.vertices)
-            left_out |= bool(hidden.any() or bounds.varies)
+            irregular |= bool(hidden.any() or bounds.varies)
         corners = np.concatenate(soup).reshape(-1, 3)
         crowd = len(corners) / 3 / most
         if crowd > 1:
@@ -379,8 +380,8 @@ class Cells(NamedTuple):
         points = points[first]
         sharp = np.zeros(len(points), dtype=bool)
         sharp[index.ravel()[:count]] = True
-        # where triangles were left out, any point may be a corner of the remaining surface
-        sharp |= left_out
+        # if triangles are left out or split to different sizes, any point may be a corner of the surface
+        sharp |= irregular
         return Cells(points, index.ravel()[count:].reshape(-1, 3), sharp)
 
     def assigned(
@@ -410,20 +411,20 @@ def _relax(
 def _with_enough_spheres(
     sizes: SphereSizeGrid, cells: Cells, centers: Points, settings: SphereSettings
 ) -> Points:
-    """Improved centers. Spheres are added until none exceeds its allowed radius by more than the tolerance,
-    or there are `settings.most` spheres."""
+    """Improved centers. Spheres are added until none exceeds its allowed radius by more than EXCESS_TOLERANCE
+    of the grid spacing, or there are `settings.most` spheres."""
     max_excess = sizes.spacing * EXCESS_TOLERANCE
     centers, largest_excess = _relax(sizes, cells, centers, settings.rounds, max_excess)
     while largest_excess > max_excess and len(centers) < settings.most:
         _, excess, _, _ = cells.assigned(sizes, centers)
-        extra = _farthest_apart(cells.points[cells.corners].mean(1), excess, len(centers) // 20 + 1)
+        extra = _worst_points(cells.points[cells.corners].mean(1), excess, len(centers) // 20 + 1)
         centers, largest_excess = _relax(
             sizes, cells, np.concatenate([centers, extra]), settings.rounds, max_excess
         )
     return centers
 
 
-def _farthest_apart(points: Points, excess: Values, count: int) -> Points:
+def _worst_points(points: Points, excess: Values, count: int) -> Points:
     """Up to `count` points with the largest excess that are at least ADDED_SPACING apart."""
     order = np.argsort(-excess)[: max(1, int((excess > 0).sum()))]
     points = points[order]
@@ -435,8 +436,8 @@ def _farthest_apart(points: Points, excess: Values, count: int) -> Points:
 
 
 def _thin_out(sizes: SphereSizeGrid, cells: Cells, centers: Points, settings: SphereSettings) -> Points:
-    """Drops spheres as long as the others can cover their cells, and returns the centers that are left.
-    Spheres that are the easiest to replace are dropped first.
+    """Drops spheres as long as the remaining ones can cover the dropped spheres' cells, and returns the
+    remaining centers. Spheres that are the easiest to replace are dropped first.
 
     When a sphere is dropped, only the spheres that take over its cells are moved.
     """

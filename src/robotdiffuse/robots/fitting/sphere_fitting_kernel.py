@@ -33,7 +33,7 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 @kernel()
 def plane_depths(points, normals, offsets, starts, lowest):
     """Distance [n] from each point to the nearest face plane of the part in which the point is deepest;
-    negative outside all parts. Values below `lowest` are replaced by it.
+    negative outside all parts. Values below `lowest` are replaced by `lowest`.
 
     Planes are as in `sphere_fitting.stacked_planes`.
     """
@@ -100,11 +100,11 @@ def farthest_corner(points, corners, c, center):
 
 
 @kernel(fastmath=True)
-def assign(points, corners, centers, depths):
-    """For each cell: the index of the sphere that covers it with the least excess, this excess, the index of
-    the second best sphere, and its excess. An index is -1 if there is no such sphere.
+def assign(points, corners, centers, max_radii):
+    """For each cell: the index of the sphere that covers it with the least excess, this excess, and the index
+    and excess of the second best sphere. An index is -1 if there is no such sphere.
 
-    `depths` are the largest allowed radii of spheres at `centers`.
+    `max_radii` are the largest allowed radii of spheres at `centers`.
     """
     owner = np.empty(len(corners), np.int64)
     min_excess = np.empty(len(corners))
@@ -117,11 +117,11 @@ def assign(points, corners, centers, depths):
         second_sphere = -1
         for i in range(len(centers)):
             # most spheres can be excluded by their distance from the first corner
-            reach = second_excess + depths[i]
+            reach = second_excess + max_radii[i]
             near = squared_distance(points[corners[c, 0]], centers[i])
             if reach <= 0.0 or near >= reach * reach:
                 continue
-            needed = math.sqrt(farthest_corner(points, corners, c, centers[i])) - depths[i]
+            needed = math.sqrt(farthest_corner(points, corners, c, centers[i])) - max_radii[i]
             if needed < best_excess:
                 second_excess = best_excess
                 best_excess = needed
@@ -138,21 +138,21 @@ def assign(points, corners, centers, depths):
 
 
 @kernel(fastmath=True)
-def greedy_cover(points, corners, places, depths):
+def greedy_cover(points, corners, places, max_radii):
     """Indices of places at which spheres cover all cells, chosen greedily: next is the sphere that covers the
     most uncovered cells.
 
-    `depths` are the largest allowed radii of spheres at `places`. A cell that no sphere of an allowed radius
-    covers counts as covered by the spheres with the least excess.
+    `max_radii` are the largest allowed radii of spheres at `places`. A cell that no sphere of an allowed
+    radius covers counts as covered by the spheres with the least excess.
     """
     covers = np.zeros((len(corners), len(places)), np.bool_)
     counts = np.zeros(len(places), np.int64)
     for c in range(len(corners)):
         min_excess = 1e9
         for i in range(len(places)):
-            if depths[i] + max(min_excess, 0.0) <= 0.0:
+            if max_radii[i] + max(min_excess, 0.0) <= 0.0:
                 continue
-            excess = math.sqrt(farthest_corner(points, corners, c, places[i])) - depths[i]
+            excess = math.sqrt(farthest_corner(points, corners, c, places[i])) - max_radii[i]
             if min_excess > 0.0 and excess < min_excess:
                 min_excess = max(excess, 0.0)
                 covers[c, :i] = False
@@ -195,12 +195,12 @@ def ball_distances(T_base_a, T_base_b, first, second):
 
 @kernel()
 def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
-    """Depth of the deepest overlap of two sets of spheres at each of n poses [m], negative if they do not
-    overlap, and the middle of this overlap.
+    """Depth of the deepest overlap of two sets of spheres at each of n poses [m], and the middle of this
+    overlap. If the sets do not overlap, the depth is minus their distance.
 
     Poses are [n, 4, 4]; middles are [n, 3], in the frame of the first set. Where the bounding balls of the
-    sets are more than `apart` from each other, the depth is minus the balls' distance. Overlaps of at most
-    `least` are ignored, and `least` is returned.
+    sets are more than `apart` from each other, the depth is minus the balls' distance. At other poses, depths
+    below `least` are replaced by `least`, with zeros as the middle.
     """
     depth = np.full(len(T_base_a), least)
     middle = np.zeros((len(T_base_a), 3))
@@ -272,24 +272,25 @@ def held_by_one(triangles, spheres):
 
 
 @allocation_free(fastmath=True)
-def excess_radius(center, own, count, grid, origin, spacing):
-    """Excess radius of the smallest sphere at a center that contains the first `count` points of `own`."""
+def excess_radius(center, assigned_points, count, grid, origin, spacing):
+    """Excess radius of the smallest sphere at a center that contains the first `count` of the assigned
+    points."""
     far = 0.0
     for k in range(count):
-        far = max(far, squared_distance(own[k], center))
+        far = max(far, squared_distance(assigned_points[k], center))
     return math.sqrt(far) - max_radius_at(center, grid, origin, spacing)
 
 
 @kernel(fastmath=True)
-def move_center(center, own, count, step, grid, origin, spacing, directions):
+def move_center(center, assigned_points, count, step, grid, origin, spacing, directions):
     """Moves `center` in place to the least excess radius, by pattern search with an initial `step`."""
-    min_excess = excess_radius(center, own, count, grid, origin, spacing)
+    min_excess = excess_radius(center, assigned_points, count, grid, origin, spacing)
     while step > MIN_STEP:
         best = min_excess - MIN_GAIN
         direction = -1
         for k in range(len(directions)):
             trial = center + step * directions[k]
-            value = excess_radius(trial, own, count, grid, origin, spacing)
+            value = excess_radius(trial, assigned_points, count, grid, origin, spacing)
             if value < best:
                 best = value
                 direction = k

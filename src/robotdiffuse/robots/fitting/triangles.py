@@ -11,7 +11,8 @@ Triangles = Float[ndarray, "_ 3 3"]
 
 def split(triangles: Triangles, size: "float | Float[ndarray, 'n']", reach: float = np.inf) -> Triangles:
     """Halve triangles at their longest edge until no edge is longer than `size` [m], a number or one per
-    triangle. Triangles farther than `reach` [m] from the origin are left out."""
+    triangle. A triangle is left out if its middle is farther from the origin than `reach` [m] plus its longest
+    edge."""
     sizes = np.broadcast_to(np.asarray(size, np.float64), len(triangles))
     return _split(np.ascontiguousarray(triangles, np.float64), sizes**2, reach)
 
@@ -23,24 +24,24 @@ def _split(triangles, squares, reach):
     limits = np.concatenate((squares, squares))
     t = 0
     while t < count:
-        longest = -1.0
+        longest_square = -1.0
         k = 0
-        middle_square = 0.0  # of the distance between the triangle's middle and the origin
+        middle_square = 0.0  # squared distance of the triangle's middle from the origin
         for i in range(3):
             square = 0.0
             middle_square += ((out[t, 0, i] + out[t, 1, i] + out[t, 2, i]) / 3) ** 2
             for d in range(3):
                 square += (out[t, i, d] - out[t, (i + 1) % 3, d]) ** 2
-            if square > longest:
-                longest = square
+            if square > longest_square:
+                longest_square = square
                 k = i
-        if np.sqrt(middle_square) > reach + np.sqrt(longest):
+        if np.sqrt(middle_square) > reach + np.sqrt(longest_square):
             # beyond reach: the last triangle takes its place
             count -= 1
             out[t] = out[count]
             limits[t] = limits[count]
             continue
-        if longest <= limits[t]:
+        if longest_square <= limits[t]:
             t += 1
             continue
         if count == len(out):
