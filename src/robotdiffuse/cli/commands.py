@@ -250,8 +250,8 @@ CHECKS = (
             Command(
                 "check",
                 "re-check a certificate, without search",
-                "Re-check a certificate with code that shares nothing with the validator. Exit status: 0 if "
-                "it holds, 1 if not, 2 for bad input.",
+                "Re-check a certificate with code that shares only data types with the validator. Exit "
+                "status: 0 if it holds, 1 if not, 2 for bad input.",
                 "verify:run_check",
                 (
                     ("file FILE", "certificate of `robotdiffuse verify --certificate`"),
