@@ -15,7 +15,8 @@ from robotdiffuse.processes.workers import RERUN_HINT, Results
 CONNECT_TIMEOUT = 5.0
 """Time for a Ray cluster to answer [s]; Ray itself would try for minutes."""
 MAX_RETRIES = 20
-"""Number of times that a call is repeated on another node of a Ray cluster after the loss of its node."""
+"""Largest number of times that a call is repeated on another node of a Ray cluster after the loss of its
+node."""
 
 
 def on_ray(call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
@@ -90,7 +91,8 @@ def ray_cluster() -> Iterator[Any]:
 
 
 def _check_reachable(address: str) -> None:
-    """Raises InputError if nothing listens at the address HOST:PORT or ray://HOST:PORT."""
+    """Raises InputError if nothing listens at the address HOST:PORT or ray://HOST:PORT. Other addresses are
+    not checked."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not host or not port.isdecimal():
         return

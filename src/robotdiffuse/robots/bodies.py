@@ -106,8 +106,8 @@ class Inertia(NamedTuple):
 
 
 def inertia_of(values: ArrayLike) -> Inertia:
-    """An inertia from the ten numbers mass, x, y, z, ixx, ixy, ixz, iyy, iyz, izz. Raises ValueError if it is
-    physically impossible."""
+    """An inertia from the ten numbers mass, x, y, z, ixx, ixy, ixz, iyy, iyz, izz. Raises ValueError for
+    anything else, and for physically impossible numbers."""
     row = np.array(values, np.float64)
     if row.shape != (10,) or not within(row):
         raise ValueError("ten finite numbers expected")
@@ -124,7 +124,8 @@ def inertia_of(values: ArrayLike) -> Inertia:
 class Payload(Value):
     """A mass that a link carries; joint torques must support it in addition to the arm.
 
-    Raises InputError for numbers that are not finite, and for negative mass or moments of inertia.
+    Raises InputError for numbers that are not finite or too large, for negative mass or moments of inertia,
+    and for a link that is not a name.
     """
 
     mass: float
@@ -134,7 +135,8 @@ class Payload(Value):
     link: str | None = None
     """Link that carries the mass; None: the robot's tip."""
     moments: GivenVector = (0.0, 0.0, 0.0)  # pyright: ignore[reportAssignmentType]
-    """Moments of inertia about the center of mass, along the frame's axes [kg m²]; 0 for a point mass."""
+    """Moments of inertia about the center of mass, along the axes of the link's frame [kg m²]; 0 for a point
+    mass."""
 
     def __post_init__(self) -> None:
         for name, shape, lower in (("mass", (), 0.0), ("com", (3,), -MAX_COORDINATE), ("moments", (3,), 0.0)):

@@ -41,20 +41,20 @@ class Stretches(NamedTuple):
 
 
 class Body(NamedTuple):
-    """The body that moves with a joint."""
+    """The body that moves with a joint, in the joint's frame."""
 
     parent: int
     """Index of the joint before this one in the tree; -1 if there is none."""
     slides: bool
     """Whether the joint is prismatic."""
     offset: float
-    """Distance between the origins of this frame and of the parent frame, with a prismatic joint at zero
-    [m]."""
+    """Distance between the origins of the joint's frame and of the parent's frame, with a prismatic joint at
+    zero [m]."""
     mass: float
-    """Mass of the bodies that are fixed to the frame [kg]."""
+    """Mass of all links that are fixed to the frame [kg]."""
     lever: float
     """Distance of the center of mass from the frame's origin [m]."""
-    moment: float
+    inertia: float
     """Largest principal moment of inertia about the center of mass [kg m²]."""
 
 
@@ -171,14 +171,14 @@ class Dynamics:
             body, (rotation, omega, alpha, linear) = bodies[j], frames[j]
             lever = _fixed(body.lever, rotation)
             body_force = body.mass * (linear + product(alpha, lever) + product(omega, product(omega, lever)))
-            inertia = body.moment * np.stack(
+            inertia = body.inertia * np.stack(
                 [np.ones_like(rotation[0]), 2 * rotation[0], 2 * rotation[1] + 4 * rotation[0] ** 2]
             )
-            moment = (
+            body_moment = (
                 product(inertia, alpha) + product(omega, product(inertia, omega)) + product(lever, body_force)
             )
             forces[j] = forces[j] + body_force
-            moments[j] = moments[j] + moment
+            moments[j] = moments[j] + body_moment
             bounds[:, j] = product(axes[j], forces[j] if body.slides else moments[j])[2]
             if body.parent >= 0:
                 forces[body.parent] = forces[body.parent] + forces[j]
@@ -205,7 +205,8 @@ class Dynamics:
 
 
 def check_dynamics(robot: Robot) -> None:
-    """Raise InputError for a robot whose URDF gives no inertias or effort limits."""
+    """Raise InputError if a planned joint of the robot has no effort limit or moves no link with an
+    inertia."""
     frames_with_mass = {robot.link_frame(link) for link in robot.inertias}
     for j, name in enumerate(robot.joint_names):
         missing = "inertia of what moves with" if j + 1 not in frames_with_mass else "effort limit of"

@@ -27,7 +27,7 @@ MAX_SPHERES = 100
 """Largest number of spheres for each solid; if they do not suffice, the spheres exceed the tolerance."""
 MAX_PIECES_PER_AXIS = 40
 BOUNDING_STEPS = 15
-"""Number of centers that the search for a small sphere around points tries, plus one."""
+"""Largest number of centers that the search for a small sphere around points tries, plus one."""
 EQUIDISTANT = 0.999
 """The search for a small sphere ends when the nearest point is at least this fraction of the radius away from
 the center."""
@@ -64,7 +64,7 @@ def _axes(vertices: Points) -> Rotation:
 
 def _lattice(size: Vector) -> tuple[int, ...]:
     """Number of pieces along each axis: the fewest pieces with spheres within the tolerance. If MAX_SPHERES
-    pieces do not suffice, the numbers with the least excess."""
+    pieces do not suffice, the numbers with which the spheres stick out least."""
     counts = np.stack(
         np.meshgrid(*3 * [np.arange(1, MAX_PIECES_PER_AXIS + 1)], indexing="ij"), axis=-1
     ).reshape(-1, 3)
@@ -103,7 +103,7 @@ def _outermost(points: Points, axis: int) -> Points:
 
 def _around(points: Points) -> Float[ndarray, "4"]:
     """A small sphere around points. Centers are tried from the center of the points' box on, by Badoiu and
-    Clarkson's algorithm; the smallest sphere is returned."""
+    Clarkson's algorithm; the smallest sphere found is returned."""
     center = (points.min(axis=0) + points.max(axis=0)) / 2
     best = np.array([*center, np.inf])
     for i in range(1, BOUNDING_STEPS):

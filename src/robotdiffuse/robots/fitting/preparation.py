@@ -65,8 +65,9 @@ GAP = 0.004
 """Points closer than this to a neighboring link count as inside it [m]: gaps between links are about this
 thin."""
 BOX_PADDING = 10 * GAP
-"""Points farther than this from a neighboring link's bounding box count as outside it [m]; a multiple of GAP,
-because near sharp edges the distance from the face planes is smaller than the distance from the link."""
+"""Points farther than this from a neighboring link's bounding box count as outside this link [m]; a multiple
+of GAP, because near sharp edges the distance from the face planes is smaller than the distance from the
+link."""
 
 
 class Neighbor(NamedTuple):
@@ -80,8 +81,8 @@ class Neighbor(NamedTuple):
 
 
 def neighbors(robot: Robot, link: str) -> tuple[Neighbor, ...]:
-    """Links with geometry that a joint connects to the given link. If the joint's parent has no geometry, the
-    nearest link with geometry above it counts, as long as only fixed joints lead to it."""
+    """Links with geometry that a joint connects to the given link. In place of a parent without geometry, the
+    nearest link with geometry above the parent counts, if only fixed joints lead from there to the parent."""
     adjacent = []
     for joint in robot.joints:
         above = joint.parent
@@ -116,9 +117,9 @@ def hidden_by_neighbors(robot: Robot, link: str) -> Callable[[Points], Mask]:
             candidates = np.flatnonzero(~hidden_points)
             for T in near_link.T_link_neighbor:
                 local = (points[candidates] - T[:3, 3]) @ T[:3, :3]
-                near = ((local >= low) & (local <= high)).all(axis=1)
-                candidates = candidates[near]
-                local = local[near]
+                in_box = ((local >= low) & (local <= high)).all(axis=1)
+                candidates = candidates[in_box]
+                local = local[in_box]
                 candidates = candidates[is_inside(local, planes, -GAP)]
             hidden_points[candidates] = True
         return hidden_points
@@ -157,7 +158,7 @@ so one measurement does not find all of them."""
 Progress = Callable[[str, int, int], None]
 """Called with the current activity, the index of the step and the number of steps."""
 CONCAVITY_SHRINKAGE = 0.5
-"""Factor per round on the concavity of convex parts with many false collisions."""
+"""Factor per round on `PartSettings.concavity` for links whose convex parts have many false collisions."""
 UNREFINED_FRACTION = 0.6
 """The pairs of links with the fewest false collisions are not refined: as many pairs as together have at most
 this fraction of `max_false_collisions`."""
@@ -218,7 +219,7 @@ class Prepared(NamedTuple):
     links: tuple[LinkReport, ...]
     pairs: tuple[PairReport, ...]
     sampled: tuple[PairReport, ...]
-    """Pairs of links as sampling alone classifies them, without the pairs given by the caller."""
+    """Pairs of links as sampling alone classifies them, whatever pairs the caller allows."""
     false_collisions: FalseCollisions
 
 
@@ -271,8 +272,8 @@ def prepare(
     """
     # the reach is measured with prismatic joints locked, since a long rail does not make an arm larger
     slides = {j.name: (j.lower + j.upper) / 2 for j in robot.planned_joints if j.kind == "prismatic"}
-    size = 0.0 if len(slides) == robot.dof else reach(robot.with_locked(slides))
-    settings = settings.for_reach(size)
+    arm_reach = 0.0 if len(slides) == robot.dof else reach(robot.with_locked(slides))
+    settings = settings.for_reach(arm_reach)
     links = {name: _Link(name, meshes, settings.parts) for name, meshes in surfaces.items()}
     steps = 2 * len(links) + 1 + settings.rounds
     for step, link in enumerate(links.values()):
@@ -379,7 +380,8 @@ def with_finer_parts(
     settings: PreparationSettings,
     seed: int,
 ) -> Robot | None:
-    """The robot with finer parts for pairs of links with false collisions of parts; None if there are none.
+    """The robot with finer parts for pairs of links whose parts collide falsely; None if there are no such
+    pairs.
 
     Starts and goals often have such false collisions, when an arm rests close to its own body.
     """
@@ -401,12 +403,12 @@ def _with_tables(
     robot: Robot, pairs: set[tuple[str, str]], changed: set[str], settings: PreparationSettings
 ) -> Robot:
     """The robot with new tables over the joints between the links of the given pairs. Existing tables of
-    links in `changed`, with changed parts, are computed again."""
-    of_parts = Links(robot)
+    links in `changed`, whose parts have changed, are computed again."""
+    links = Links(robot)
     pairs = pairs | {table.links for table in robot.tables if changed & {*table.links}}
     tables = {table.links: table for table in robot.tables}
     for pair in sorted(pairs):
-        tables[pair] = joint_table(robot, of_parts, pair, settings.finest / 4)
+        tables[pair] = joint_table(robot, links, pair, settings.finest / 4)
     return replace(robot, tables=tuple(tables.values()))
 
 
@@ -425,8 +427,8 @@ def _shared(pair: PairFalseCollisions, link: str) -> Spheres:
     Covering an area A takes about A / t spheres that stick out by t. Together the two links need the fewest
     spheres if they share the gap in proportion to the square roots of their areas.
     """
-    areas = np.sqrt([len(pair.places[link]), *(len(places) for places in pair.places.values())])
-    return pair.places[link] * (1, 1, 1, 2 * areas[0] / max(areas[1:].sum(), 1))
+    roots = np.sqrt([len(pair.places[link]), *(len(places) for places in pair.places.values())])
+    return pair.places[link] * (1, 1, 1, 2 * roots[0] / max(roots[1:].sum(), 1))
 
 
 def _worst(false_collisions: FalseCollisions, allowed: float) -> list[PairFalseCollisions]:
@@ -485,7 +487,7 @@ class PairDifference(NamedTuple):
     sampled: str
     """The reason found by sampling, or `checked`."""
     colliding: float
-    """Fraction of the configurations in which the meshes collide."""
+    """Fraction of the configurations in which convex parts of the two links collide."""
     srdf: str
     """The SRDF's reason, or `checked`."""
 
@@ -513,8 +515,8 @@ class AddReport(NamedTuple):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Problems that will limit planning, and allowed pairs of links with colliding meshes that a person
-        should check."""
+        """Problems that will limit planning, and allowed pairs of links with colliding convex parts that a
+        person should check."""
         warnings = []
         rates = self.false_collisions
         worst_text = "; ".join(f"{' against '.join(p.links)} {p.by_spheres:.1%}" for p in rates.pairs[:3])
@@ -532,7 +534,7 @@ class AddReport(NamedTuple):
                 "configurations"
             )
         warnings += [
-            f"{' against '.join(pair.links)} is not checked, though the URDF's meshes collide in "
+            f"{' against '.join(pair.links)} is not checked, though convex parts collide in "
             f"{pair.colliding:.1%} of the configurations, {ASSUMED_SAFE[pair.reason]}; make "
             f"sure that the arm cannot hit itself there"
             for pair in self.pairs
@@ -597,7 +599,7 @@ def add_robot(
             f"--name NAME"
         )
     folder = user_robots() / name if out is None else Path(out)
-    with lock_folder(folder):  # it can be written
+    with lock_folder(folder):  # fails early if the folder cannot be written
         pass
     robot = replace(robot, name=name)
     if limits is not None:
@@ -627,8 +629,8 @@ def add_robot(
         options = " ".join(f"--allow {' '.join(pair)}" for pair in colliding_pairs)
         names = "; ".join(f"{' and '.join(pair)} collide in {shares[pair]:.1%}" for pair in colliding_pairs)
         raise InputError(
-            f"{urdf}: every configuration collides with itself: {names}; if these links may touch, add "
-            f"{options}, or give an SRDF that allows such "
+            f"{urdf}: the arm collides with itself in every configuration: {names}; if these links may "
+            f"touch, add {options}, or give an SRDF that allows such "
             f"pairs with --srdf FILE"
         )
     differences = tuple(
@@ -639,13 +641,13 @@ def add_robot(
         if semantics is not None and (pair.reason == "checked") == (frozenset(pair.links) in srdf_allowed)
     )
     source = {"urdf": Path(urdf).name, "sha256": tree.digest, "license": license}
-    shares = {"free": round(measured.free, 4), "refused": round(measured.by_spheres, 4)}
+    fractions = {"free": round(measured.free, 4), "refused": round(measured.by_spheres, 4)}
     note = (
         f"{measured.free:.1%} of the configurations are free of self-collision; convex parts "
         f"collide falsely in {measured.by_parts:.1%} of these, spheres in "
         f"{measured.by_spheres:.1%}"
     )
-    write_robot_folder(replace(prepared.robot, notes=(*robot.notes, note)), folder, source | shares)
+    write_robot_folder(replace(prepared.robot, notes=(*robot.notes, note)), folder, source | fractions)
     seconds = time.process_time() - begin
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_UNIT
     return AddReport(

@@ -3,8 +3,8 @@ that pass so close to each other that covering spheres overlap, such as a flange
 
 The relative pose of two links depends only on the joints between them. For one or two such joints, a table
 over their values tells where the convex parts of the links are apart. A cell of the table counts as free if
-the links' distance at its center exceeds the largest relative motion of the links within the cell. Other
-cells are split, down to a fraction of a millimeter of motion.
+the links' distance at its center exceeds their largest relative motion from the center to a point of the
+cell. Other cells are split, down to a fraction of a millimeter of motion.
 """
 
 # Coal's Python module has no type information.
@@ -110,7 +110,8 @@ class Links:
 
     def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Values:
         """Signed distances [n] between the covering spheres of two links [m]: lower bounds of the distances
-        of the links' meshes. Beyond NEAR_DISTANCE, it is the distance of their bounding balls."""
+        of the links' meshes. Where the bounding balls of the links' spheres are more than NEAR_DISTANCE
+        apart, the distance of these two balls is given."""
         first, second = (for_kernels(self.robot.spheres[link]) for link in (a, b))
         return -deepest_touches(poses[a], poses[b], first, second, NEAR_DISTANCE, -np.inf)[0]
 
@@ -184,7 +185,8 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
     """Table over the one or two joints between two links that tells where their convex parts are apart.
 
     Boxes of joint values are not split further if the links move by less than `finest` [m] relative to each
-    other within the box. Their cells count as colliding unless they are proven free.
+    other from the center of the box to any of its points. The cells of such a box count as colliding unless
+    they are proven free.
     """
     joints = robot.joints_between(*pair)
     far = max(pair, key=robot.link_frame)
@@ -204,12 +206,12 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
     parts = np.indices([len(robot.meshes[link]) for link in pair]).reshape(2, -1)
     low = np.zeros((parts.shape[1], len(joints)))
     while len(low):
-        cells, cell_of_row = np.unique(low, axis=0, return_inverse=True)
-        q = np.tile(nominal, (len(cells), 1))
-        q[:, columns] = lower + edge * (cells + size / 2)
+        boxes, box_of_row = np.unique(low, axis=0, return_inverse=True)
+        q = np.tile(nominal, (len(boxes), 1))
+        q[:, columns] = lower + edge * (boxes + size / 2)
         travel = float(lever @ (edge * size) / 2) + ROUNDING
         poses = links.poses(q, pair)
-        distance = links.part_distances(poses, *pair, cell_of_row.ravel(), parts, travel)
+        distance = links.part_distances(poses, *pair, box_of_row.ravel(), parts, travel)
         touch = distance <= travel
         # boxes that count as colliding: a single cell with a collision at its center, a box with a collision
         # deeper than its motion, and a box with very little motion
