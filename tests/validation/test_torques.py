@@ -52,7 +52,7 @@ def test_a_peak_between_two_times_is_found() -> None:
     rows = np.pi / 2 + np.array([[-0.375], [-0.125], [0.125], [0.375]])
     motion = rd.Trajectory(("hinge",), np.arange(4.0), rows, np.full((4, 1), 0.25), np.zeros((4, 1)))
     found = beyond(9.66, trajectory_pieces(motion))
-    assert found is not None and 1 < found.place < 2 and 1.01 * 9.66 < found.torque < 9.82
+    assert found is not None and 1 < found.place < 2 and 1.01 * 9.66 < found.value < 9.82
     assert beyond(9.75, trajectory_pieces(motion)) is None
 
 

@@ -17,13 +17,14 @@ class Violation:
     message: str
     """What is violated, in one line."""
     subject: str | None = None
-    """The link that collides or is constrained, or the joint that is out of limits."""
+    """The link that collides, is constrained or misses its goal pose; the joint that exceeds a limit, jumps
+    or is off the start; or the missed waypoint."""
     other: str | None = None
     """The obstacle, the other link or the kind of constraint."""
     excess: float | None = None
     """Amount of the violation, in its own unit. For a contact, its greatest depth [m]; for a constraint, the
-    greatest excess over its limit until it is met again; otherwise the excess over a limit, or the error at
-    start or goal."""
+    greatest excess over its limit until it is met again; for a step by nearly a whole turn, the size of the
+    step; otherwise the excess over a limit, or the error at start or goal."""
 
     @property
     def line(self) -> str:

@@ -22,7 +22,7 @@ RESOLUTION = 1e-3
 still exceed its limit then, it counts as exceeding it."""
 MAX_OPEN_PIECES = 100_000
 """Maximum number of pieces that are halved at once. If there are more, as in motions with very many turns,
-their values count as exceeding the limits."""
+their values that are not proved to be within the limits count as exceeding them."""
 PLACE_RESOLUTION = 1 / 64
 """Resolution of the place where a value first exceeds its limit, as a fraction of a step from row to row."""
 States = tuple[JointRows, JointRows, JointRows]
@@ -33,8 +33,8 @@ class Pieces(NamedTuple):
     """The pieces of a motion, from each row to the next."""
 
     states: Callable[[Int[ndarray, "n"], Values], States]
-    """States at places. A place is the index of a piece, and its share: the traveled fraction of the
-    piece."""
+    """States at places. A place is the index of a piece, and a share: the fraction of the piece that has
+    passed."""
     along: Stretches
     """Bounds on positions and derivatives along each piece; derivatives are with respect to the share."""
 
@@ -43,13 +43,14 @@ class Excess(NamedTuple):
     """The first value that exceeds its limit, or is not proved to be within its limit."""
 
     place: float
-    """Row, plus the traveled share of the piece after it."""
-    joint: int
+    """Row, plus the share of the piece after it."""
+    column: int
     """Index of the joint, or of the frame."""
-    torque: float
+    value: float
     """The torque of the joint [N m] or [N], or the speed of the frame [m/s]."""
     excess: float
-    """Largest excess along the motion, in the unit of `torque`."""
+    """Largest excess of this joint or frame along the motion, in the unit of `value`, over its limit with the
+    allowed slack."""
 
 
 def trajectory_pieces(trajectory: Trajectory) -> Pieces:
@@ -60,11 +61,11 @@ def trajectory_pieces(trajectory: Trajectory) -> Pieces:
     extremes = cubics.extremes
     h = cubics.steps
     change = np.abs(extremes.end - extremes.start)
-    pull = np.stack([extremes.acceleration, change, np.zeros_like(change)])
+    accelerations = np.stack([extremes.acceleration, change, np.zeros_like(change)])
     max_velocities = extremes.velocity
-    speed = np.stack([max_velocities, h * pull[0], h * change])
+    speed = np.stack([max_velocities, h * accelerations[0], h * change])
     farthest = _farthest(trajectory.positions) + h * max_velocities / 2
-    return Pieces(cubics.states, Stretches(farthest, h * speed, speed, pull))
+    return Pieces(cubics.states, Stretches(farthest, h * speed, speed, accelerations))
 
 
 def static_pieces(q: Configurations) -> Pieces:

@@ -44,7 +44,8 @@ CHORD_SHARE = 0.1
 """Collision is checked on straight lines, and certified clearances are reduced by how far the cubics leave
 these lines. Rows are added until the reduction is at most this fraction of the clearance."""
 CHORD_MARGIN = 0.9
-"""Safety factor on the `chord` that is computed for the next try, so that a single retry suffices."""
+"""Safety factor on the next `chord` to try (the greatest distance between cubics and lines), so that a single
+retry suffices."""
 
 
 RATE_KINDS = ("rest", "rates", "velocity", "acceleration", "jump")
@@ -64,7 +65,8 @@ def verify(problem: Problem, motion: Path | Trajectory, settings: VerifySettings
         Whether the motion is valid, the first violation, and certified clearances.
 
     Raises:
-        InputError: If the motion's joints are not those of the robot, or its shapes are wrong.
+        InputError: If an argument has a wrong type, or the motion has other joints than the robot or wrong
+            shapes.
 
     Examples:
         >>> robot = rd.load_robot("panda")
@@ -169,18 +171,18 @@ class Verifier:
         chord = self.settings.chord
         radii = self._continuous.checks.motion_radii
         while True:
-            times, positions, off = cubics.sampled(chord)
+            times, positions, joint_bounds = cubics.sampled(chord)
             still = None if at_rest is None else np.isin(times, cubics.trajectory.times[at_rest])
             report = self._report(positions, times, found, still, along)
             clearance = report.min_clearance
             if clearance is None:
                 return report
-            reduction = float((radii @ off).max(initial=0.0))
+            reduction = float((radii @ joint_bounds).max(initial=0.0))
             allowed = max(CHORD_SHARE * clearance, settings.tightness * settings.contact / 2)
             if reduction <= allowed:
                 scene, itself = np.array([report.scene_clearance, report.self_clearance]) - reduction
                 return replace(report, scene_clearance=float(scene), self_clearance=float(itself))
-            chord = CHORD_MARGIN * float(off.max()) * allowed / reduction
+            chord = CHORD_MARGIN * float(joint_bounds.max()) * allowed / reduction
 
     def collision_free(self, path: Path) -> bool:
         """Whether a path is certified free of collision and proved to keep the path constraints. Start, goal
@@ -248,13 +250,13 @@ class Verifier:
             collision = collision_violation(sweep.contact, _time_at(sweep.contact.at, clock))
         ends = (self._waypoints(q, clock, at_rest), self._goal(q[-1], float(clock[-1])))
         hit = None if moving is None or moving.contact is None else _moving_contact_violation(moving.contact)
-        every = [v for v in (first, collision, hit, *ends) if v is not None]
-        violation = min(every, key=lambda v: v.time, default=None)
+        earliest = [v for v in (first, collision, hit, *ends) if v is not None]
+        violation = min(earliest, key=lambda v: v.time, default=None)
         valid = violation is None
         scene, itself = (sweep.scene_clearance, sweep.self_clearance) if valid else (None, None)
         if scene is not None and moving is not None:
             scene = min(scene, moving.clearance)
-        return Report(valid, violation, scene, itself, found=tuple(dict.fromkeys((*found, *every))))
+        return Report(valid, violation, scene, itself, found=tuple(dict.fromkeys((*found, *earliest))))
 
     def _start(self, q: ndarray) -> Violation | None:
         difference = np.abs(q[0] - self.problem.start)
@@ -268,8 +270,8 @@ class Verifier:
         return Violation("start", 0.0, message, name, None, excess)
 
     def _wrapped(self, q: ndarray, clock: ndarray) -> Violation | None:
-        """A violation if a continuous joint turns by nearly a whole turn in one step, where wrapped angles
-        are probable."""
+        """A violation if a continuous joint turns by nearly a whole turn in one step, probably because its
+        values were wrapped."""
         turns = self.robot.wraps(q)
         wrapped = np.flatnonzero(turns.any(axis=1))
         if not len(wrapped):
@@ -339,9 +341,9 @@ class Verifier:
         if beyond is None:
             return None
         at = _time_at(beyond.place, trajectory.times)
-        constraint = self.constraints.speed_limited[beyond.joint]
-        speed_limit = limits[beyond.joint]
-        speed, limit = distinct(beyond.torque, speed_limit, digits=4)
+        constraint = self.constraints.speed_limited[beyond.column]
+        speed_limit = limits[beyond.column]
+        speed, limit = distinct(beyond.value, speed_limit, digits=4)
         message = f"{constraint.frame} moves at {speed} m/s; {constraint.kind} allows {limit} m/s"
         return Violation("speed", at, message, constraint.frame, constraint.kind, beyond.excess)
 
@@ -353,8 +355,8 @@ class Verifier:
         if beyond is None:
             return None
         at = _time_at(beyond.place, clock)
-        name = self.robot.joint_names[beyond.joint]
-        message = self.dynamics.torque_message(beyond.joint, beyond.torque) + what
+        name = self.robot.joint_names[beyond.column]
+        message = self.dynamics.torque_message(beyond.column, beyond.value) + what
         return Violation("torque", at, message, name, None, beyond.excess)
 
     def _twitch(self, q: ndarray, clock: ndarray) -> Violation | None:
@@ -499,8 +501,9 @@ def violations(
 ) -> tuple[Violation, ...]:
     """All violations of a motion in the order of their places; empty if it is valid.
 
-    They include every contact, at the place where it begins; joint limits once for each joint; and the first
-    violation of every other kind.
+    They include every contact with static obstacles and between links, at the place where it begins; joint
+    limits once for each joint; and the first violation of every other kind, also the first contact with a
+    moving obstacle. If numbers are not finite, or times are not those of a motion, only this is returned.
     """
     from robotdiffuse.collision.contacts import contacts  # imported here, since nothing else needs it
 

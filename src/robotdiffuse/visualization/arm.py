@@ -84,8 +84,8 @@ def timed(motion: Path | Trajectory) -> tuple[Values, Configurations]:
 def facts(
     motion: Path | Trajectory, result: PlanResult | None, robot: Robot | None = None
 ) -> list[tuple[str, str]]:
-    """Labels and values of facts about a motion, for headers and captions. With `robot`, they also say if the
-    robot is drawn by its collision geometry, because no visual meshes are bundled."""
+    """Labels and values of facts about a motion, for headers and captions. With `robot`, one of them says
+    that the arm is drawn by its collision geometry, if no visual meshes of this robot are bundled."""
     length = result.path_length if result is not None else None
     if length is None:
         length = Path(motion.joint_names, motion.positions).length

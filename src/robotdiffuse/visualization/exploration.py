@@ -99,11 +99,11 @@ def shares(known: RecordedView) -> list[tuple[str, str]]:
 def moments(explorer: RecordedExplorer) -> list[Moment]:
     """The moments of all steps before which there was a view, in order."""
     recorded = []
-    for number, record in enumerate(explorer.steps):
-        before = [view for view in explorer.views if view.step_index < number]
-        during = [view for view in explorer.views if view.step_index == number]
+    for index, record in enumerate(explorer.steps):
+        before = [view for view in explorer.views if view.step_index < index]
+        during = [view for view in explorer.views if view.step_index == index]
         if before:
-            recorded.append(Moment(number + 1, record, [before[-1], *during]))
+            recorded.append(Moment(index + 1, record, [before[-1], *during]))
     return recorded
 
 
@@ -198,8 +198,8 @@ def write_exploration_picture(explorer: RecordedExplorer, scene: Scene, file: st
 
     The picture of a moment shows the arm's motion and what was known when it was chosen: voxels seen occupied
     (blue), predicted voxels (violet), the boundary of unknown space (gray, see-through), and for the kind
-    `look` the camera's view pyramid at its end. `scene` is the true scene, used only to choose the view.
-    Raises InputError for a file name with another ending, or a file that cannot be written.
+    `look` the camera's view pyramid at the end of the motion. `scene` is the true scene, used only to choose
+    the view. Raises InputError for a file name with another ending, or a file that cannot be written.
     """
     path = check_output(file, (".png",))
     all_moments = moments(explorer)
@@ -220,10 +220,10 @@ def _chosen(count: int) -> list[int]:
     return [*np.linspace(0, count - 3, MAX_MOMENTS - 2).round().astype(int), count - 2, count - 1]
 
 
-def _tile(explorer: RecordedExplorer, moment: Moment, known: Voxels, camera: Camera) -> Image.Image:
+def _tile(explorer: RecordedExplorer, moment: Moment, in_scene: Voxels, camera: Camera) -> Image.Image:
     robot = explorer.robot
     record = moment.record
-    layers = shown_voxels(moment.known, record, known)
+    layers = shown_voxels(moment.known, record, in_scene)
     occupied, predicted, unknown = (
         faces_surface(*pair, color) for pair, color in zip(layers, (OBSERVED, WHITE, WHITE), strict=True)
     )
@@ -290,21 +290,21 @@ def write_exploration(explorer: RecordedExplorer, scene: Scene, file: str | File
     write_atomically(target, page_text(f"{robot.name} · exploration", data, "exploration.js"))
 
 
-def _page_time(time: float, number: int) -> float:
-    """Time on the page, where each step begins with a pause, of a `time` during the step with this index
-    [s]."""
-    return round(time + READING_TIME * (number + 1), 4)
+def _page_time(time: float, index: int) -> float:
+    """The time on the page of a `time` during the step with this index [s]. On the page, a pause comes before
+    the motion of each step."""
+    return round(time + READING_TIME * (index + 1), 4)
 
 
 def _whole_motion(explorer: RecordedExplorer) -> Trajectory:
     """The motions of all steps as one trajectory, with the pauses between them."""
     times = []
     positions = []
-    for number, record in enumerate(explorer.steps):
-        times.append(np.array([_page_time(record.begins, number - 1)]))
+    for index, record in enumerate(explorer.steps):
+        times.append(np.array([_page_time(record.begins, index - 1)]))
         positions.append(record.configuration[None])
         if record.trajectory is not None:
-            times.append(_page_time(record.begins, number) + record.trajectory.times)
+            times.append(_page_time(record.begins, index) + record.trajectory.times)
             positions.append(record.trajectory.positions)
     q = np.concatenate(positions)
     return Trajectory(explorer.robot.joint_names, np.concatenate(times), q, 0 * q, 0 * q)
@@ -319,8 +319,8 @@ def _known(explorer: RecordedExplorer) -> list[dict[str, Any]]:
     for moment in moments(explorer):
         record = moment.record
         for i, view in enumerate(moment.views):
-            number = moment.number - 1
-            time = _page_time(view.time, number) if i else _page_time(record.begins, number - 1)
+            index = moment.number - 1
+            time = _page_time(view.time, index) if i else _page_time(record.begins, index - 1)
             layers = shown_voxels(view, record, known_scene)
             after = [faces_between(*pair)[0] for pair in layers]
             changed = [np.setxor1d(a, b) for a, b in zip(before, after, strict=True)]

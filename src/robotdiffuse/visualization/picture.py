@@ -33,7 +33,7 @@ ELEVATIONS = np.radians((15.0, 25.0))
 VERTICAL_FIELD = np.radians(28)
 """Vertical field of view [rad]."""
 VIEW_GHOSTS = 5
-"""Number of poses along a motion, besides the last, for which a view is chosen."""
+"""Number of poses along a motion, besides the last, that the chosen view should show."""
 MAX_FRAMING_DISTANCE = 1.3
 """The view is framed to include obstacles up to this distance from the middle of the motion [m]."""
 
@@ -160,25 +160,25 @@ def _earlier(rows: int, count: int) -> list[int]:
 def _score(camera: Camera, arm: Surface, ghosts: Surface, trace: Points, obstacles: Surface) -> float:
     """Score of a view: the visible fraction of the arm, plus half the visible fraction of the ghosts, plus
     the visible length of the trace relative to the height of the picture."""
-    hidden, _, _ = drawn_by(camera, obstacles)
+    obstacle_nearness, _, _ = drawn_by(camera, obstacles)
     score = 0.0
     for part, weight in ((arm, 1.0), (ghosts, 0.5)):
         nearness, _, _ = drawn_by(camera, part)
-        score += weight * float((nearness > hidden).sum() / max(1, (nearness > 0).sum()))
+        score += weight * float((nearness > obstacle_nearness).sum() / max(1, (nearness > 0).sum()))
     pixels = camera.project(trace)
     column = pixels[:, 0].astype(int)
     row = pixels[:, 1].astype(int)
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     column = column.clip(0, camera.width - 1)
     row = row.clip(0, camera.height - 1)
-    visible = inside & (pixels[:, 2] > hidden[row, column])
+    visible = inside & (pixels[:, 2] > obstacle_nearness[row, column])
     steps = np.linalg.norm(np.diff(pixels[:, :2], axis=0), axis=1)
     return score + float(steps[visible[1:]].sum()) / camera.height
 
 
 SUPERSAMPLING = 2
 """Number of rendered pixels per pixel along each side."""
-# numbers of directional lights for the sky and for the main light, and the edges of their shadow maps
+# numbers of directional lights for the sky and for the main light, and the edge lengths of their shadow maps
 # [pixels]
 SKY_LIGHTS = 60
 SKY_MAP = 320
@@ -270,7 +270,7 @@ def write_comparison(
     """Write a picture of several motions of one arm in one scene as .png. `motions` are given by name.
 
     The arm is drawn along the first motion; each motion has a trace in its own color. Raises InputError in
-    the cases in which `write_picture` raises it, and for more motions than there are colors.
+    the cases in which `write_picture` raises it, and if there are no motions or more motions than colors.
     """
     path = check_output(file, (".png",))
     if not 0 < len(motions) <= len(COMPARED):

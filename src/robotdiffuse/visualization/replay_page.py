@@ -285,9 +285,9 @@ def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | N
     or a file that cannot be written.
     """
     target = check_output(file, (".html", ".htm", ".png"))
-    goal, validity = _goal_state(problem)
+    goal_configuration, validity = _goal_state(problem)
     validities = {"start": problem.is_free(problem.start), "goal": validity}
-    states = np.stack([problem.start] if goal is None else [problem.start, goal])
+    states = np.stack([problem.start] if goal_configuration is None else [problem.start, goal_configuration])
     scene = problem.scene.with_shapes([*problem.scene.shapes, *(moving.shape for moving in problem.moving)])
     robot, scene = replace(problem, scene=scene, moving=()).robot_and_scene_in_world()
     T_world_base = IDENTITY if problem.T_world_base is None else problem.T_world_base
@@ -325,8 +325,8 @@ def _goals(problem: Problem) -> Sequence[OneGoal]:
 
 
 def _goal_state(problem: Problem) -> tuple[Configuration | None, StateValidity]:
-    """The first free goal configuration, or else the first goal configuration, and its validity; None if no
-    configuration reaches the goal."""
+    """The first free goal configuration, or else the first goal configuration, and its validity; None and
+    UNREACHED if no configuration that reaches the goal was found."""
     rng = np.random.default_rng(0)
     first = None
     for goal in _goals(problem):
@@ -359,7 +359,7 @@ def _raised(surface: Surface) -> Surface:
     """The surface in the color of collisions, moved outwards by OFFSET."""
     import trimesh
 
-    # sharp edges have a vertex for each face; trimesh merges those at one point
+    # sharp edges have a vertex for each face; trimesh merges the vertices at one point
     merged = trimesh.Trimesh(surface.vertices, surface.faces)
     vertices = np.array(merged.vertices) + OFFSET * merged.vertex_normals
     return creased(vertices, np.array(merged.faces), painted(COLLIDING, len(merged.faces)))

@@ -1,8 +1,7 @@
 """A live exploration: its session, and the page that shows it in browsers.
 
 A thread of the session chooses steps and executes them at the speed of the motion. Visitors can pause, step,
-restart and change the options. A step of the kind `look` moves the arm to
-take a view.
+restart and change the options. A step of the kind `look` moves the arm to take a view.
 """
 
 import html
@@ -230,6 +229,7 @@ class ExplorationSession:
                 last = time.perf_counter()
             time.sleep(1 / FRAME_RATE)
             now = time.perf_counter()
+            # a slow speed does not prolong the pause before the motion
             speed = self.state.speed if at >= 0 else max(self.state.speed, 1.0)
             at = min(at + speed * (now - last), record.duration)
             last = now

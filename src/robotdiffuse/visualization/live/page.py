@@ -119,6 +119,7 @@ class Page(LivePage):
         self._moving = Obstacles(server)
         self._arms: dict[str, Arm] = {}
         self._frames: Float[ndarray, "n frames 4 4"] | None = None
+        """T_base_frame of all frames along the shown motion, at POSE_RATE."""
         self._lock = threading.Lock()
         self.player = Player(self._show_time)
         self._begin()
@@ -671,8 +672,8 @@ class Obstacles:
 
 
 def _appearance(shape: Shape) -> object:
-    """Shapes with equal keys have equal geometry, apart from the pose. Shapes without sizes, such as height
-    maps, have a key for each object."""
+    """A key of a shape's geometry without its pose: shapes with equal keys look alike. A shape without sizes,
+    such as a height map, has a key of its own."""
     if isinstance(shape, Mesh):
         return "mesh", shape.vertices.tobytes(), shape.faces.tobytes()
     if isinstance(shape, PointCloud):

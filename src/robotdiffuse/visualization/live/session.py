@@ -368,7 +368,7 @@ def _opened(problem: Problem, options: PageOptions) -> State:
 
 def _posed(goal: Goal, frame: str, T_base_frame: Pose) -> PoseGoal | PosesGoal:
     """The goal with another pose of one link. Tolerances and the poses of other links are unchanged. A joint
-    goal becomes a pose goal."""
+    goal, or several alternative goals, become one pose goal."""
     if isinstance(goal, PoseGoal):
         return replace(goal, T_base_frame=T_base_frame)
     if isinstance(goal, PosesGoal):
@@ -576,7 +576,7 @@ class Changes:
         self._shown: dict[str, tuple[object, ...]] = {}
 
     def new(self, what: str, *values: object) -> bool:
-        """Whether values differ from the last values with the name `what`, and remember them. Numbers, texts
+        """Whether values differ from the last values with the name `what`, and remember them. Floats, texts
         and tuples are compared by value, other objects by identity."""
         last_values = self._shown.get(what)
         self._shown[what] = values
