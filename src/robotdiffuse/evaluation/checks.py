@@ -64,8 +64,9 @@ COST_TOLERANCE = 0.05
 """Largest fraction by which the path through the stored waypoints, which cuts corners, may be shorter than
 the recorded length."""
 ROUNDING = 1e-4
-"""Largest fraction by which the path through the stored waypoints may be longer than the recorded length;
-also the tolerance of the detour."""
+"""Allowance for rounding. The path through the stored waypoints may be longer than the recorded length by
+this fraction of that length plus this value in [rad]. The recorded detour times the straight distance may
+differ from the recorded length by this fraction of it, or by this value in [rad] if that is more."""
 PYBULLET_STEP = 0.01
 """PyBullet checks the waypoints, and configurations between them that are at most this far apart [rad,
 joint-space L2]."""
@@ -172,8 +173,8 @@ def check_data(
         progress: Called with the number of checked motions and the total number, first with 0.
 
     Raises:
-        InputError: If there is no data set, for another robot than that of the data, and if PyBullet is
-        required but not installed.
+        InputError: If the manifest is missing or damaged, if there are no shards, for another robot than that
+            of the data, and if PyBullet is required but not installed.
     """
     began = time.perf_counter()
     manifest = read_manifest(folder)
@@ -183,31 +184,32 @@ def check_data(
         import robotdiffuse.simulation  # noqa: F401  (fails at once if PyBullet is not installed)
     indices = existing_shards(folder)
     task = _Task(str(folder), manifest, robot, pybullet)
-    motions = min(manifest.trajectories, sys.maxsize if count is None else count)
-    workers = min(workers, max(len(indices), -(-motions // MOTIONS_PER_TASK)))
+    motions_to_check = min(manifest.trajectories, sys.maxsize if count is None else count)
+    workers = min(workers, max(len(indices), -(-motions_to_check // MOTIONS_PER_TASK)))
     checked = 0
     least_clearance = np.inf
     with Workers(workers if workers > 1 else 0) as processes:
-        sizes = dict(zip(indices, in_order(processes.each(task.size, [(i,) for i in indices])), strict=True))
-        findings = [Finding("damaged", i, None, size) for i, size in sizes.items() if isinstance(size, str)]
-        rows = {i: size for i, size in sizes.items() if isinstance(size, int)}
+        answers = in_order(processes.each(task.row_count_or_defect, [(i,) for i in indices]))
+        shards = dict(zip(indices, answers, strict=True))
+        findings = [Finding("damaged", i, None, text) for i, text in shards.items() if isinstance(text, str)]
+        row_counts = {i: rows for i, rows in shards.items() if isinstance(rows, int)}
         parts = [
             (index, chosen[i : i + MOTIONS_PER_TASK])
-            for index, chosen in pick_rows(rows, count, seed).items()
+            for index, chosen in pick_rows(row_counts, count, seed).items()
             for i in range(0, len(chosen), MOTIONS_PER_TASK)
         ]
         total = sum(len(chosen) for _, chosen in parts)
         progress(checked, total)
         results = in_order(processes.each(task.validate, parts))
-        for (_, chosen), (part, clearance) in zip(parts, results, strict=True):
-            findings += part
+        for (_, chosen), (found, clearance) in zip(parts, results, strict=True):
+            findings += found
             least_clearance = min(least_clearance, clearance)
             checked += len(chosen)
             progress(checked, total)
     return DataCheck(
         robot=robot.name,
         shards=len(indices),
-        motions=sum(rows.values()),
+        motions=sum(row_counts.values()),
         planned=manifest.trajectories,
         checked=checked,
         pybullet=pybullet,
@@ -226,7 +228,7 @@ class _Task:
     robot: Robot
     pybullet: bool
 
-    def size(self, index: int) -> int | str:
+    def row_count_or_defect(self, index: int) -> int | str:
         """Number of rows of a shard, or a message about its defect."""
         try:
             return len(check_shard(self.folder, index, self.manifest))
@@ -284,9 +286,9 @@ def _defects(task: _Task, shard: Shard, row: int) -> Defects:
     recorded = {"clearance": shard["clearance"][row, None], "end_clearance": shard["end_clearance"][row]}
     measured = {"clearance": clearances.min(keepdims=True), "end_clearance": clearances[[0, -1]]}
     for name, values in recorded.items():
-        worst_row = int(np.abs(values - measured[name]).argmax())
-        stated = float(values[worst_row])
-        value = float(measured[name][worst_row])
+        worst = int(np.abs(values - measured[name]).argmax())
+        stated = float(values[worst])
+        value = float(measured[name][worst])
         if abs(stated - value) > CLEARANCE_TOLERANCE:
             yield "clearance", f"{name} is {1e3 * stated:.2f} mm; measured: {1e3 * value:.2f} mm"
 
@@ -310,7 +312,7 @@ def _lengths(shard: Shard, row: int, path: Path) -> Defects:
     cost = float(shard["cost"][row])
     detour = float(shard["detour"][row])
     if not cost * (1 - COST_TOLERANCE) - ROUNDING <= path.length <= cost * (1 + ROUNDING) + ROUNDING:
-        yield "cost", f"cost is {cost:.4f} rad; the waypoints are {path.length:.4f} rad long"
+        yield "cost", f"cost is {cost:.4f} rad; the path through the waypoints has {path.length:.4f} rad"
     straight = float(np.linalg.norm(path.positions[-1] - path.positions[0]))
     if abs(detour * straight - cost) > ROUNDING * max(cost, 1.0):
         ratio = cost / max(straight, 1e-9)
@@ -320,7 +322,7 @@ def _lengths(shard: Shard, row: int, path: Path) -> Defects:
 # Motions of a bench
 
 CONFIRM_STEP = 0.02
-"""Largest distance between two checked configurations [rad, joint-space L2]."""
+"""Largest distance between successive checked configurations [rad, joint-space L2]."""
 
 
 @dataclass(frozen=True)

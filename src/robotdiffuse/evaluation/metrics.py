@@ -1,4 +1,5 @@
-"""Metrics of motions. A metric that is added to _METRICS appears in all records and tables."""
+"""Metrics of motions. A metric that is added to _METRICS appears in all records, and in the bench's
+tables of metrics."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -83,7 +84,7 @@ class Metric:
     unit: str
     """Unit in tables."""
     better: Literal["more", "less", ""]
-    """Whether larger or smaller values are better."""
+    """Whether larger ("more") or smaller values ("less") are better; empty if neither."""
     format: str
     """Format of numbers, such as `.2f`."""
     measure: Measure
@@ -107,7 +108,8 @@ def _timed(measure: Callable[[Trajectory, Robot], float | None]) -> Measure:
 
 def _over_straight_line(trajectory: Trajectory, robot: Robot) -> float | None:
     """The duration of the motion, divided by the shortest time along the straight line from its first to its
-    last configuration. For the straight line, obstacles and jerk limits are ignored."""
+    last configuration. For the straight line, obstacles and jerk limits are ignored. None if a limit of
+    velocity or acceleration is not positive, or if both configurations are equal."""
     if min(robot.velocity.min(), robot.acceleration.min()) <= 0:
         return None
     q = trajectory.positions
@@ -198,7 +200,7 @@ def bending(positions: Configurations) -> float:
 
 
 def turning(positions: Configurations) -> float:
-    """Sum of the angles between successive segments that have a length [rad]."""
+    """Sum of the angles between successive segments [rad]; segments up to STANDSTILL are left out."""
     steps = np.diff(positions, axis=0)
     steps = steps[np.linalg.norm(steps, axis=1) > STANDSTILL]
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)

@@ -70,7 +70,7 @@ STREAM = 1_000
 
 
 def draw_problem(number: int) -> dict[str, Problem]:
-    """The problem with this number for the Panda, by problem set."""
+    """The problems with this number for the Panda, by problem set."""
     robot = load_robot("panda")
     rng = np.random.default_rng([SEED, STREAM, number])
     sample = ROP.draw(robot, rng, 1, POSITION)
@@ -104,8 +104,8 @@ def problem_file(out: FilePath, problem_set: str) -> FilePath:
 
 
 def write_problems(out: FilePath, count: int, report: Progress) -> None:
-    """Draw the first `count` non-trivial problems of both sets and write them into the folder of a bench,
-    unless it has as many already."""
+    """Draw the first `count` non-trivial problems of each set and write them into the folder of a bench,
+    unless the folder has as many already."""
     files = {name: CaseFile(problem_file(out, name)) for name in GOALS}
     if min(map(len, files.values())) < count:
         cases: dict[str, list[Case]] = {name: [] for name in GOALS}
@@ -161,9 +161,9 @@ ONE_SAMPLE = ("samples=1", "guidance_steps=0", "repeat=false")
 """Planner settings for a single sample without collision guidance, as in the row JPC of the paper's Table 2
 (losses of joints, points and collision)."""
 NO_WEIGHTS = (
-    f"The row *{AS_IN_PAPER}* is missing: there are no weights of the paper's size with its encoder. Train "
-    "them with `robotdiffuse train planner --config paper --data FOLDER --encoder FOLDER --out FOLDER` and "
-    "give their folder as --paper-weights."
+    f"The row *{AS_IN_PAPER}* is missing, since --paper-weights is not given. No weights of the paper's size "
+    "are bundled: train them with `robotdiffuse train planner --config paper --data FOLDER --encoder FOLDER "
+    "--out FOLDER` and give their folder."
 )
 PAPER_METHOD = "RobotDiffuse"
 """Name of the row of the paper's own method in its Table 1."""
@@ -186,7 +186,8 @@ PAPER_TABLE_1 = (
     PaperRow("MPD", Indicators(79.7, 12.4, 14.142, 9.0), 0.645),
     PaperRow("RobotDiffuse", Indicators(84.9, 9.8, 14.218, 15.0), 0.765),
 )
-"""The paper's own formulas, applied to the figures of its Table 1, give other scores than the printed ones:
+"""The paper's own formulas, applied to the figures of its Table 1, give other scores than the printed ones.
+The first four columns are the normalized figures:
 
 | row          | success | collision | length | time  | ComScore | printed | difference |
 |--------------|---------|-----------|--------|-------|----------|---------|------------|
@@ -264,8 +265,8 @@ class Table1Settings:
     cpu_time: bool = False
     """See `BenchSettings`."""
     paper_weights: str | None = None
-    """Folder with weights of a network without clearances as inputs, such as the configs `paper` and
-    `points`. They get two rows of single samples: one with guidance and one without."""
+    """Folder with weights of a network without clearances as inputs, such as a network trained with the
+    config `paper` or `points`. The network gets two rows of single samples: with and without guidance."""
     data: str | None = None
     """Folder of a data set, for a row with the nearest motions of the data."""
     workers: int = 1
@@ -319,8 +320,8 @@ def run_table1(settings: Table1Settings, report: Progress, done: Done) -> Bench:
 
 
 def _title(folder: str) -> str:
-    """Name of the row for the weights in a folder, with their encoder, denoiser and number of training
-    samples. Raises InputError if the folder has no weights."""
+    """Name of the row for the weights in a folder, with their encoder, their denoiser and their number of
+    training samples in percent of the paper's. Raises InputError if the folder has no weights."""
     about = read_description(folder_of(folder), "model")
     settings = MotionModelSettings.from_json(about.get("settings"), f"{folder}/model.json: settings")
     parts = settings.encoder, settings.denoiser, settings.waypoints
@@ -347,7 +348,7 @@ def _check_paper_weights(folder: str, time_limit: float) -> None:
     seconds = steps * min(timeit.repeat(lambda: model.denoised(*zeros), number=1, repeat=3))
     if seconds > time_limit:
         raise InputError(
-            f"time_limit is {time_limit:g} s and paper_weights is {folder}, of which a single sample takes "
+            f"time_limit is {time_limit:g} s and paper_weights is {folder}, with which a single sample takes "
             f"about {seconds:.0f} s here ({steps} denoising steps): no call would end in time. Give a time "
             f"limit of at least {2 * seconds:.0f}"
         )
@@ -419,11 +420,11 @@ def _table(section: Section, rows: dict[str, Row]) -> Table:
     for planner_row in comparison.rows:
         row = rows[planner_row.planner]
         collision = planner_row.figures.collision / 100
-        collisions = wilson_interval(round(collision * comparison.problems), comparison.problems)
+        interval = wilson_interval(round(collision * comparison.problems), comparison.problems)
         cells = (
             row.name,
             planner_row.success,
-            share_cell(collision, collisions),
+            share_cell(collision, interval),
             *(planner_row.mean(METRICS[name]) for name in MEASURES),
             indicators[row.name].time,
             comscore[row.name],

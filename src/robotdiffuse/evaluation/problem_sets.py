@@ -48,8 +48,8 @@ def case_file(folder: FilePath | None, name: str) -> CaseFile:
 def hard_cases(
     family: str, count: int, folder: FilePath | None = None, report: Progress = lambda text: None
 ) -> list[Case]:
-    """The first `count` non-trivial held-out problems of a family. The folder stores the problems with the
-    results of validator and search."""
+    """The first `count` held-out problems of a family that are not trivial and that the search solves. The
+    folder stores the problems with the results of validator and search."""
     return case_file(folder, family).held_out(family, count, validator, search, report)
 
 
@@ -74,9 +74,10 @@ def problem_set_name(text: str) -> str:
 def gather_cases(names: list[str], count: int | None, out: FilePath, report: Progress) -> list[Case]:
     """The first `count` problems of each set (None: all of a file or folder, 100 of a family).
 
-    Problems are stored in `out`/problems, one file for each set, and read from there next time. With a larger
-    `count`, problems are added. `report` is called with lines of text about the progress. Raises InputError
-    for unknown names and empty sets.
+    Problems are stored in `out`/problems, one file for each set, and read from there next time. If `count` is
+    then larger, problems of families are added. `report` is called with lines of text about the progress.
+    Raises InputError for unknown and repeated names, for empty sets, and if a file or folder has another
+    content than the problems that are stored under its name.
     """
     repeated_names = repeated(problem_set_name(text) for text in names)
     if repeated_names:

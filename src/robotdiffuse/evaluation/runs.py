@@ -37,7 +37,7 @@ ENDED_EARLY = 0.9
 """A call that took less than this fraction of its time limit ended by itself: a longer limit would give the
 same result."""
 SHORTEST_FACTOR = 1 + 1e-6
-"""A path counts as shortest if it is at most this factor longer than the shortest known or possible path."""
+"""A path counts as shortest if its length is at most this multiple of the shortest known or possible one."""
 RESTARTABLE = {SOLVED, Status.TIMEOUT.value, Status.NO_PATH.value}
 """Statuses of calls for which another seed can give another result."""
 RESTARTED = "+restarts"
@@ -90,7 +90,7 @@ class Record:
     memory: float | None = None
     """Peak memory of the planner's process up to the end of the call [MB]."""
     run: str = ""
-    """Name of the session that made the call, its starting time; empty if unknown."""
+    """The session that made the call, named by its starting time; empty if unknown."""
     workers: int | str = ""
     """Number of simultaneous calls, or the name of the cluster."""
     load: float | None = None
@@ -148,13 +148,13 @@ class Record:
 
 
 def record_of_row(row: dict[str, Any]) -> Record:
-    """The record from JSON data. Unknown fields become `measures`; raises TypeError if their values are not
-    numbers."""
+    """The record from JSON data. Unknown fields become `measures`. Raises TypeError if the value of such a
+    field is not a number, or if a field without a default is missing."""
     measures = dict(row)
     values = {f.name: measures.pop(f.name) for f in fields(Record) if f.name in row}
     for name, value in measures.items():
         if not isinstance(value, int | float):
-            raise TypeError(f"{name} is no field of a record and no number")
+            raise TypeError(f"{name} is neither a field of a record nor a number")
     for name in ("progress", "positions"):
         values[name] = tuple(map(tuple, values.get(name, ())))
     return Record(**values, measures=measures)
@@ -341,12 +341,12 @@ def run_all(
         bar: Whether a progress bar is shown.
 
     Returns:
-        The records of each method, in the order of the cases.
+        The records of each method, in the order of the seeds; for each seed, in the order of the cases.
     """
     files = {name: RecordFile(None if folder is None else record_path(folder, name)) for name in methods}
-    recorded = {(name, record.key) for name, file in files.items() for record in file.records}
+    existing = {(name, record.key) for name, file in files.items() for record in file.records}
     runs = runs_of(cases, methods, seeds, limit)
-    todo = [run for run in runs if (run.method, run.key) not in recorded]
+    todo = [run for run in runs if (run.method, run.key) not in existing]
     with Progress(transient=True, console=Console(stderr=True), disable=not bar) as progress:
         task = progress.add_task(title, total=len(runs), completed=len(runs) - len(todo))
         keep_records(todo, in_this_process(methods, todo), files, lambda _: progress.advance(task))

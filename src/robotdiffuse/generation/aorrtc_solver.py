@@ -56,7 +56,7 @@ class AORRTCSearch:
         self._start_goal = StartGoal(checker, start.astype(np.float64), goals.astype(np.float64))
         distances = falling_clearances(settings.safety_distance, checker, np.stack([start, *goals]))
         self._levels = len(distances) + 2
-        """Largest number of times that `tries` iterations are made without a path."""
+        """Number of distances plus 2: at the lowest distance, `tries` iterations are made three times."""
         self._search = AnytimeSearch(
             self._start_goal,
             SearchSettings(range=settings.range, resolution=settings.resolution),

@@ -84,13 +84,13 @@ class GenerationSettings(Settings):
     seed: Natural = 0
     mix: dict[str, float] = field(default_factory=lambda: {"rop": 1.0})
     """Relative number of problems of each family of scenes; the default is the paper's. A row of the data
-    contains the index of its family in this order."""
+    contains the index of its family in this mapping."""
     trivial_share: Share = 1.0
     """Probability that a trivial problem, which a straight line solves, is used; 1 is the paper's
     distribution."""
     target: Annotated[str, OneOf(TARGETS)] = POSITION
-    """What a target states of the tip: its position, as in the paper, or its pose. Families of furniture
-    always use the pose."""
+    """Whether a target is a position of the tip, as in the paper, or a pose. Families of furniture always use
+    the pose."""
     goals: Annotated[int, Bound(least=1.0, most=127.0)] = 10
     """Largest number of goal configurations of a target, found by inverse kinematics (the paper's k)."""
     waypoints: Annotated[int, Bound(least=2.0)] = 254
@@ -99,7 +99,7 @@ class GenerationSettings(Settings):
     """Spacing of waypoints: evenly in joint-space length (arc), or in time by time parameterization
     (time)."""
     shard: Count = 500
-    """Number of trajectories in a shard. An interruption loses at most one shard."""
+    """Number of trajectories in a shard. An interruption loses at most one shard per worker."""
     planner: Annotated[str, OneOf(SEARCHES)] = "shared_tree_rrt_star"
     """Planner that solves the problems; the default is the paper's."""
     search: Annotated[SharedTreeSettings | AORRTCSearchSettings, SettingsOf("planner", SEARCHES)] = field(
@@ -135,7 +135,7 @@ class GenerationSettings(Settings):
         return -(-self.trajectories // self.shard)
 
     def rows(self, index: int) -> int:
-        """Trajectories of a shard; the last shard may have fewer."""
+        """Number of trajectories in a shard; the last shard may have fewer than `shard`."""
         return min(self.shard, self.trajectories - index * self.shard)
 
 
@@ -156,7 +156,7 @@ def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts
 
     The counts are numbers of problems: `tried`: all; `solved`: those in the shard; `thinned`: trivial ones
     that were left out; `unsolved`: those without a path; `refused`: those whose motions the validator
-    rejected. Raises InputError if hardly any problem can be solved.
+    rejected. Raises InputError if hardly any problem can be used.
     """
     robot = load_robot(settings.robot)
     rows = settings.rows(index)
@@ -165,8 +165,8 @@ def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts
     while len(solved_rows) < rows:
         if counts["tried"] >= MAX_PROBLEMS_PER_ROW * rows + EXTRA_PROBLEMS:
             raise InputError(
-                f"only {len(solved_rows)} of {counts['tried']} problems were solved for {robot.name}; "
-                f"a smaller safety_distance than {settings.search.safety_distance} m or other scenes may help"
+                f"only {len(solved_rows)} of {counts['tried']} problems gave a motion for {robot.name}; try "
+                f"trivial_share 1, other scenes or safety_distance below {settings.search.safety_distance} m"
             )
         number = index * PROBLEMS_PER_SHARD + counts["tried"]
         counts["tried"] += 1
@@ -232,7 +232,8 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
 
 
 def draw(settings: GenerationSettings, robot: Robot, rng: np.random.Generator) -> tuple[int, SampledProblem]:
-    """A random problem, after the index of its family in the mix; both depend only on the state of `rng`."""
+    """The index of a random family in the mix, and a random problem of this family; both depend only on the
+    state of `rng`."""
     shares = np.array(list(settings.mix.values()))
     number = int(rng.choice(len(shares), p=shares / shares.sum()))
     family = list(settings.families.values())[number]
@@ -242,8 +243,8 @@ def draw(settings: GenerationSettings, robot: Robot, rng: np.random.Generator) -
 def _resampled(
     settings: GenerationSettings, robot: Robot, path: Configurations, validator: Verifier
 ) -> tuple[ndarray | None, Configurations] | None:
-    """Times (None without timing) and joint values of the waypoints; None if the validator rejects the timed
-    motion."""
+    """Times and joint values of the waypoints. With the timing "arc", the times are None, and nothing is
+    validated; with "time", the result is None if the validator rejects the path or the timed motion."""
     if settings.timing == "arc":
         return None, resample(path[None], settings.waypoints)[0]
     waypoints = Path(robot.joint_names, path.astype(np.float64))
@@ -275,8 +276,9 @@ def generate(
     cluster that RAY_ADDRESS names, or by a cluster started here. `progress` is called with the number of
     trajectories that are done and the number of all.
 
-    Raises InputError if the folder's data have other settings or are of another version or robot, if the
-    folder cannot be written, and if another process is filling it.
+    Raises InputError for `workers` below 1 and an unknown cluster, if the folder's data have other settings
+    or are of another version or robot, if the folder cannot be written or another process is filling it, and
+    in the cases in which `make_shard` raises it.
     """
     if workers < 1:
         raise InputError(f"workers is {workers}; it must be at least 1")
@@ -291,7 +293,7 @@ def generate(
             missing = [index for index in range(settings.shards) if index not in existing]
             finished = settings.trajectories - sum(settings.rows(index) for index in missing)
             progress(finished, settings.trajectories)
-            # closing the iterator stops the workers at once if this is interrupted
+            # closing the iterator stops the workers at once if the loop is interrupted
             with closing(_shards(settings, missing, workers, cluster)) as shards:
                 for number, (arrays, counts) in shards:
                     index = missing[number]
@@ -356,7 +358,8 @@ def manifest_of(settings: GenerationSettings) -> Manifest:
 
 
 def _claim(wanted: Manifest, out: FilePath) -> None:
-    """Write the manifest into a new folder; raise InputError if the folder has a manifest of other data."""
+    """Write the manifest into a new folder. Raise InputError if the folder has a manifest of other data, or
+    shards without a manifest."""
     if not (out / MANIFEST).exists():
         if shard_indices(out):
             raise InputError(f"{out} holds shards but no {MANIFEST}; use another folder")
