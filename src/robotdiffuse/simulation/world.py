@@ -161,7 +161,7 @@ class World:
         ]
 
     def gap(self, point: tuple) -> float:
-        """Signed distance [m] of a PyBullet contact point, corrected for the margins of meshes."""
+        """Signed distance [m] of a PyBullet contact point, corrected for the margins of links' meshes."""
         margins = 2 if point[OTHER] == self.body else 1
         return float(point[DISTANCE] + margins * COLLISION_MARGIN)
 

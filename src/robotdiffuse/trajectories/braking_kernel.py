@@ -15,7 +15,7 @@ from robotdiffuse.trajectories.timing_kernel import NEGLIGIBLE_DERIVATIVE
 MIN_INTERVAL = 1e-10
 """A motion that begins closer than this before a grid point begins in the interval after it [rad]."""
 STILL_SPEED_SQUARED = 1e-12
-"""ṡ² below this counts as rest."""
+"""ṡ² below this counts as rest [rad²/s²]."""
 
 
 @kernel()

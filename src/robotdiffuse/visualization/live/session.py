@@ -316,8 +316,8 @@ class Session:
         self.on_change()
 
     def _solve(self, state: State) -> tuple[PlanResult | None, str, tuple[tuple[str, float], ...]]:
-        """Plans for a state. Returns the planner's result, or None and the reason why it failed, and the
-        times of its stages."""
+        """Plans for a state. Returns the planner's result (None if it failed), the reason why it failed (else
+        ""), and the times of its stages."""
         options = state.options
         problem = state.problem
         try:
