@@ -194,7 +194,7 @@ class Workspace:
             Distinct configurations [k, dof]; no rows if none was found.
 
         Raises:
-            InputError: For a pose that is not rigid, and `near` of the wrong length.
+            InputError: For a pose that is not rigid, `near` of the wrong length, and a count below 1.
         """
         T = self._T_base_world @ rigid_transform("pose", pose)
         return self.robot.ik(T, self.tip, near=near, count=count)

@@ -25,7 +25,8 @@ ADVICE = "lengths are in meters: divide millimeters by 1000"
 
 
 def unit_notes(problem: Problem) -> tuple[str, ...]:
-    """Notes on obstacles that may be in millimeters: on each that is too large, or on all if none is in
+    """Notes on obstacles and views that may be in millimeters: one on each that is too large (for views, also
+    too far away). If there is none, and no view or moving obstacle, one on all obstacles if none is in
     reach."""
     reach = reach_bound(problem.robot)
     shapes = [shape for shape in problem.scene.shapes if not isinstance(shape, (SeenPoints, AssumedPoints))]

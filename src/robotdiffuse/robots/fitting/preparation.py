@@ -1,7 +1,7 @@
 """Prepares a robot for planning: convex parts, covering spheres and allowed collisions from its collision
 meshes.
 
-If parts or spheres collide in a configuration although the true meshes do not, planning cannot use this
+If parts or spheres collide in a configuration although the true meshes do not, searches cannot use this
 configuration. Preparation measures these false collisions. If a pair of links has many of them, its parts and
 spheres are computed again, finer at the places where they touch. If spheres cannot be fine enough, a table
 over the joints between the links tells at which joint values the links are apart.
