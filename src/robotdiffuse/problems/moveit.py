@@ -546,7 +546,7 @@ def _joint_goal(where: str, goal: dict[str, Any]) -> dict[str, float]:
 
 
 def _wide_tolerances(region: dict[str, Any], orientation: dict[str, Any]) -> list[str]:
-    """The tolerances of a pose goal that permit much more than the validator does."""
+    """The tolerances of a pose goal that permit more than the validator does."""
     shapes = mappings_of("", region, "primitives")
     sizes = [size for _, shape in shapes for size in list_of("", shape, "dimensions")]
     angles = [orientation.get(f"absolute_{axis}_axis_tolerance", 0) for axis in "xyz"]

@@ -35,8 +35,9 @@ MAX_STOPPED_RANGE = 5.2
 ranges may be arbitrary."""
 MAX_UNEXPLAINED = 0.25
 """Largest fraction of the variance of "the links collide" (0 or 1) that the value of one joint may leave
-unexplained. Below it, the joint is taken to decide whether they collide, and the pair is not checked because
-the limits of the joint prevent it (the reason `limits` in `self_collisions`)."""
+unexplained. Below it, the joint is taken to decide whether they collide. If they do at one of its stops, the
+stop is taken to be where they meet, and the pair is not checked (the reason `limits` in
+`self_collisions`)."""
 BALL_MARGIN = 1e-9
 """Margin of bounding and inscribed balls of meshes [m], larger than rounding errors."""
 NEAR_DISTANCE = 0.1
