@@ -86,9 +86,10 @@ def creased(
 ) -> Surface:
     """A surface that is shaded smoothly except across sharp edges (CREASE_ANGLE), where vertices are
     duplicated so that each side has a normal of its own. colors: a color per face, 0 to 1."""
-    edges = vertices[faces]
-    area = np.cross(edges[:, 1] - edges[:, 0], edges[:, 2] - edges[:, 0])
-    unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-12)
+    triangles = vertices[faces]
+    # normals of the faces: of twice the face's area in length, and of length 1
+    scaled = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    unit = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-12)
     # the corners of all faces, sorted by their vertex (`owner`)
     corner = np.argsort(faces.reshape(-1), kind="stable")
     owner = faces.reshape(-1)[corner]
@@ -102,7 +103,9 @@ def creased(
     face = corner // 3
     # normal of a corner: sum over the faces at its vertex that make a smooth edge with its own face
     alike = np.einsum("ij,ij->i", unit[face[mine]], unit[face[partner]]) > np.cos(CREASE_ANGLE)
-    summed = [np.bincount(mine[alike], area[face[partner[alike]], i], minlength=len(owner)) for i in range(3)]
+    summed = [
+        np.bincount(mine[alike], scaled[face[partner[alike]], i], minlength=len(owner)) for i in range(3)
+    ]
     normals = np.stack(summed, axis=1).astype(np.float64)  # integers if no face has an area
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     # corners with the same vertex, normal and color become one vertex of the surface
@@ -126,7 +129,7 @@ class Drawable:
     """An obstacle as it is drawn."""
 
     shape: Shape
-    """Where it is at time 0, in the base frame."""
+    """The obstacle's shape where it is at time 0, in the base frame."""
     color: Color
     moving: MovingObstacle | None = None
 
@@ -136,11 +139,11 @@ class Drawable:
 
     @cached_property
     def surface(self) -> Surface:
-        """Where it is at time 0, in the base frame; a point cloud becomes octahedra."""
+        """The surface where the obstacle is at time 0, in the base frame; a point cloud becomes octahedra."""
         return _surface(self.shape, self.color)
 
     def frame(self, time: float = 0.0) -> Pose:
-        """The pose of its own frame in the base frame at a time [s]."""
+        """The pose of the obstacle's own frame in the base frame at a time [s]."""
         return own_frame(self.shape) if self.moving is None else self.moving.pose(time)
 
     @property
@@ -155,7 +158,7 @@ class Drawable:
         return self if self.moving is None else self.own
 
     def surface_at(self, time: float) -> Surface:
-        """The surface where it is at a time [s], in the base frame."""
+        """The surface where the obstacle is at a time [s], in the base frame."""
         return self.surface.moved(self.frame(time) @ inverse(self.frame()))
 
 
@@ -179,7 +182,7 @@ def own_frame(shape: Shape) -> Pose:
         return np.eye(4)
 
 
-def _color(shape: Shape, own: Color) -> Color:
+def _color(shape: Shape, usual: Color) -> Color:
     if isinstance(shape, SeenPoints | AssumedPoints):
         return OBSERVED if isinstance(shape, SeenPoints) else ASSUMED
     size = 0.0
@@ -189,7 +192,7 @@ def _color(shape: Shape, own: Color) -> Color:
         size = max(shape.height, 2 * shape.radius)
     elif isinstance(shape, Triangulated):
         size = np.ptp(shape.mesh.vertices, axis=0).max()
-    return FURNITURE if size > FURNITURE_SIZE else own
+    return FURNITURE if size > FURNITURE_SIZE else usual
 
 
 def _surface(shape: Shape, color: Color) -> Surface:

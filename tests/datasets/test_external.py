@@ -158,7 +158,7 @@ def test_what_is_wrong_is_named(tmp_path: Path) -> None:
         ([], SCENES[0], "paths is empty"),
         ([[0.0] * 7], SCENES[0], r"paths\[0\] is .* it must be n x 7 numbers"),
         (far, SCENES[:3], r"paths\[2\], row 0: panda_joint1 is 9 rad; its limits are -2.8973"),
-        (MOTIONS, SCENES[:3], "scenes are 3; they must be one rd.Scene, or one for each of 24 paths"),
+        (MOTIONS, SCENES[:3], "scenes has 3 entries; give one rd.Scene, or one for each of 24 paths"),
         (MOTIONS[:1], rd.Scene([rd.Cylinder([1, 1, 1], 0.1, 0.1)]), "only spheres and boxes can be packed"),
     ):
         refuses(message, rd.write_dataset, paths, around, tmp_path / "own")

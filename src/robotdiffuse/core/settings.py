@@ -132,15 +132,14 @@ class Setting(NamedTuple):
     name: str
     """Dotted for a field of settings within settings."""
     default: Any
-    """The value: the default, for settings that were not changed."""
+    """The present value, which is the default unless the setting was changed."""
     rule: str
     """Allowed values."""
     description: str
 
     @property
     def value(self) -> str:
-        """The default in the form that `Settings.changed` takes; "..." if it has more than LONG
-        characters."""
+        """`default` in the form that `Settings.changed` takes; "..." if it has more than LONG characters."""
         plain = self.default is None or isinstance(self.default, bool)
         text = str(self.default).lower() if plain else str(self.default)
         return text if len(text) <= LONG else "..."
@@ -265,12 +264,12 @@ class Settings:
     def _replaced(self: Given, values: Mapping[str, Any], where: str, known: list[str]) -> Given:
         hints = _hints(type(self))
         replaced = {}
-        within = dict[str, dict[str, Any]]()
+        nested_changes = dict[str, dict[str, Any]]()
         for name, value in values.items():
             first, dot, rest = str(name).partition(".")
             nested = first in hints and isinstance(getattr(self, first), Settings)
             if nested and (dot or isinstance(value, Mapping)):
-                within.setdefault(first, {}).update({rest: value} if dot else value)
+                nested_changes.setdefault(first, {}).update({rest: value} if dot else value)
             elif nested or name not in hints:
                 root, _, path = f"{where}.{name}".partition(".")
                 owner = root or type(self).__name__
@@ -278,7 +277,7 @@ class Settings:
                 raise InputError(f"{owner} has no setting {shown(path)}; it has {', '.join(known)}{hint}")
             else:
                 replaced[name] = converted(f"{where}.{name}".removeprefix("."), hints[name], value)
-        for name, changes in within.items():
+        for name, changes in nested_changes.items():
             group = f"{where}.{name}".removeprefix(".")
             replaced[name] = getattr(self, name)._replaced(changes, group, known)
         return dataclasses.replace(self, **replaced)  # type: ignore[type-var]
@@ -338,7 +337,7 @@ def converted(where: str, hint: Any, value: Any, owner: object = None) -> Any:
     """The value as its field stores it: a list as a tuple, a number of NumPy as Python's int or float.
 
     owner: the settings object, for marks that compare the field with another field; None before it exists.
-    Raises InputError for a value of the wrong type or out of bounds.
+    Raises InputError for a value of the wrong type, out of bounds, or refused by another mark of the field.
     """
     if not _fits(hint, value):
         raise InputError(f"{where} is {shown(value)}; it takes {_rule(hint)}")

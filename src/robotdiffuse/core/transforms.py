@@ -16,7 +16,7 @@ IDENTITY = np.eye(4)
 
 
 def rotation_from_quaternion(wxyz: Float[ndarray, "*b 4"]) -> Float[ndarray, "*b 3 3"]:
-    """Rotation matrix of a quaternion, normalized first."""
+    """Rotation matrix of a quaternion, which is normalized first."""
     if wxyz.ndim == 1:  # Python floats: for four numbers, NumPy takes several times as long
         w, x, y, z = wxyz.tolist()
         norm = math.sqrt(w * w + x * x + y * y + z * z)
@@ -112,7 +112,8 @@ def pose(xyz: ArrayLike, *, wxyz: ArrayLike | None = None, rpy: ArrayLike | None
         The homogeneous transform [4, 4].
 
     Raises:
-        InputError: If wxyz and rpy are given, and for anything but finite numbers.
+        InputError: If both wxyz and rpy are given, for a zero quaternion, for too many or too few values, and
+            for values that are no numbers within ±1e4 (rpy: ±6.3, about a turn).
 
     Examples:
         >>> rd.pose([0.5, 0, 0.3], rpy=[0, 0, np.pi / 2])[0].round(3).tolist()

@@ -146,7 +146,7 @@ class Tree(NamedTuple):
     nodes: Float[ndarray, "n dof"]
     """[rad], [m] for prismatic joints; roots first."""
     parents: Int[ndarray, "n"]
-    """Row of each node's parent, which is above the node's own row; -1 for roots."""
+    """Row of each node's parent, which comes before the node's own row; -1 for roots."""
 
 
 class State(NamedTuple):
@@ -202,8 +202,8 @@ class Trajectory(Value):
 
     @property
     def peak_jerks(self) -> Float[ndarray, "dof"]:
-        """The largest jerk of each joint [rad/s³] or [m/s³], with accelerations linear between the rows. A
-        joint with an acceleration at the start or the end has infinite jerk, since it jumps from or to 0."""
+        """The largest jerk of each joint [rad/s³] or [m/s³], with accelerations linear between the rows. If a
+        joint accelerates at the start or end, its jerk is infinite, since the acceleration jumps there."""
         steps = np.diff(self.times)[:, None]
         between = np.abs(np.diff(self.accelerations, axis=0) / steps).max(axis=0, initial=0.0)
         return np.where((self.accelerations[[0, -1]] == 0).all(axis=0), between, np.inf)
@@ -301,7 +301,7 @@ class Trajectory(Value):
             rate: Rows in a second [Hz]; None: the rows of the motion.
 
         Raises:
-            InputError: For another ending, or a file that cannot be written.
+            InputError: For another ending, a file that cannot be written, or a rate that `resample` refuses.
         """
         path = check_output(file, (".json", ".csv"))
         if rate is not None:
@@ -359,10 +359,10 @@ def spline_rows(
     every time; jerks are constant between rows. With a window of 1, the spline leaves the motion's path by at
     most about a sixth of the acceleration times `step` squared; straight lines stay straight.
     """
-    before = np.arange(-window - 2, 0)[:, None] * step * np.broadcast_to(velocity, controls.shape[1])
+    lead_in = np.arange(-window - 2, 0)[:, None] * step * np.broadcast_to(velocity, controls.shape[1])
     moved = np.concatenate(
         [
-            before,
+            lead_in,
             controls - controls[0],
             np.repeat(controls[-1:] - controls[0], window + 1, axis=0),
         ]
@@ -396,9 +396,9 @@ def check_motion_arrays(
         where: Text before field names in messages, e.g. "trajectory.".
 
     Raises:
-        InputError: Naming the field, for missing or repeated joint names, no rows, wrong shapes, and numbers
-            that are not finite or too large. Times may begin anywhere and need not increase; see
-            `check_increasing`.
+        InputError: Naming the field, for missing or repeated joint names, no rows, wrong shapes, numbers that
+            are not finite or too large, and times that span more than MAX_DURATION. Times may begin anywhere
+            and need not increase; see `check_increasing`.
     """
     names = joint_names
     if not isinstance(names, list | tuple) or not names or not all(isinstance(n, str) and n for n in names):

@@ -80,8 +80,9 @@ def write_dataset(
         paths: Joint values of each motion [n, dof], in the order of the robot's planned joints [rad] or [m];
             or paths and trajectories, whose positions are taken. They are resampled evenly in joint space.
         scenes: The scene of each motion, of spheres and boxes; or one scene for all motions. If all scenes
-            begin with the same box named "floor", the arm stands on it, and it is not an obstacle.
-        folder: An empty folder.
+            begin with the same box, not rotated and named "floor", the arm stands on it, and it is not an
+            obstacle.
+        folder: A folder without data; it is made if it does not exist.
         robot: A robot, or an argument of `load_robot`.
         waypoints: Number of waypoints of a stored motion.
 
@@ -89,8 +90,9 @@ def write_dataset(
         The number of motions.
 
     Raises:
-        InputError: For joint values of the wrong shape or out of limits, obstacles that are no spheres or
-            boxes, a folder that holds data, and if no scene falls into the training split.
+        InputError: If there are no paths, if a list of scenes does not have one for each path, and if no scene
+            falls into the training split; for joint values of the wrong shape or out of limits, obstacles that
+            are no spheres or boxes, fewer than 2 waypoints, and a folder that holds data.
 
     Examples:
         >>> start, goal = [0, -0.8, 0, -2.4, 0, 1.6, 0.8], [0.5, -0.2, 0, -2, 0, 1.8, 0.8]
@@ -107,7 +109,7 @@ def write_dataset(
     per_path = [scenes] * len(motions) if isinstance(scenes, Scene) else list(scenes)
     if len(per_path) != len(motions) or not all(isinstance(scene, Scene) for scene in per_path):
         raise InputError(
-            f"scenes are {len(per_path)}; they must be one rd.Scene, or one for each of {len(motions)} paths"
+            f"scenes has {len(per_path)} entries; give one rd.Scene, or one for each of {len(motions)} paths"
         )
     floor = _shared_floor(per_path)
     slots = max(len(scene.shapes) for scene in per_path) - (floor is not None)
@@ -270,7 +272,8 @@ def import_npz(
     authors' arm has no hand. The safety distance is unknown and set to 0. `progress` is called with the
     number of motions that are done and the number of all.
 
-    Raises InputError if the file is no robot.npz, or the folder holds data or cannot be written.
+    Raises InputError if the file is no robot.npz, the robot has other than 7 joints, the radius is not
+    positive, or the folder holds data or cannot be written.
     """
     arm = load_robot(robot)
     folder = FilePath(folder)

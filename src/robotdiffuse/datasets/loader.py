@@ -87,8 +87,8 @@ class RopDataset(Dataset[dict[str, Tensor]]):
                 each path; None: the stored waypoints.
 
         Raises:
-            InputError: For unknown names, a folder without data or with damaged shards, and data of another
-                robot.
+            InputError: For an unknown split, fewer than 1 point or 2 waypoints, a folder without data or with
+                damaged shards, and data of another robot.
         """
         check_name("split", split, SPLITS)
         if points < 1:
@@ -143,8 +143,8 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         number = -1 if worker is None else worker.id
         if number not in self._generators:
             # each worker has its own random numbers, and new ones in every epoch
-            start = self.seed if worker is None else worker.seed % 2**63
-            self._generators[number] = torch.Generator(self.device).manual_seed(start)
+            seed = self.seed if worker is None else worker.seed % 2**63
+            self._generators[number] = torch.Generator(self.device).manual_seed(seed)
         batch = self._batch(np.array(indices), self._generators[number])
         columns = {field.name: getattr(batch, field.name) for field in fields(batch)}
         return [{name: column[i] for name, column in columns.items()} for i in range(len(indices))]

@@ -110,8 +110,8 @@ def path_of(robot: Robot, shard: Shard, row: int) -> Path:
 
 
 def motion_of(robot: Robot, shard: Shard, row: int) -> Path | Trajectory:
-    """The motion of a row: a path, or, if the data have times, a trajectory with velocities and accelerations
-    by finite differences."""
+    """The motion of a row: a path, or, if the row has times that increase, a trajectory with velocities and
+    accelerations by finite differences."""
     path = path_of(robot, shard, row)
     times = np.asarray(shard.arrays.get("times", ()), np.float64)
     if not len(times) or not (np.diff(times[row]) > 0).all():
@@ -136,11 +136,12 @@ class Rows:
     turn: int
     """Number of the turned copy; 0 for the rows as they are in the shard."""
     q: Float32[ndarray, "n waypoints dof"]
-    """Joint values of the waypoints [rad]."""
+    """Joint values of the waypoints [rad], [m] for prismatic joints."""
     scenes: PackedScenes
     """The scenes with their floors."""
     split: Int8[ndarray, "n"]
-    """Index into SPLITS; -1 for copies that must not be used."""
+    """Index into SPLITS; -1 for copies that must not be used: those of rows that are not for training, and
+    those that touch the base link."""
 
 
 def read_rows(
@@ -154,7 +155,7 @@ def read_rows(
     turns: number of turned copies of the training rows, see `turned`; above 0, `waypoints` and `robot` are
         needed.
 
-    Raises InputError, naming the shard, if data are missing, damaged or of another robot.
+    Raises InputError if data are missing, damaged or of another robot.
     """
     manifest = read_manifest(folder)
     if robot is not None:
@@ -207,10 +208,11 @@ def turned(
     scenes: PackedScenes,
     rng: np.random.Generator,
 ) -> tuple[Float32[ndarray, "n waypoints dof"], PackedScenes, Mask]:
-    """Turn each motion and its scene by a random angle, uniform within the limits of the first joint.
+    """Turn each motion and its scene by a random angle of at most pi, uniform within the limits of the first
+    joint.
 
-    Returns the turned motions, the turned scenes, and which motions do not collide with the base.
-    `turns_about_vertical` must hold for the robot.
+    Returns the turned motions, the turned scenes, and which motions are free of self-collision: a motion
+    could be turned into the base link. `turns_about_vertical` must hold for the robot.
     """
     first = q[:, :, 0]
     low = np.maximum(robot.lower[0] - first.min(1), -np.pi)

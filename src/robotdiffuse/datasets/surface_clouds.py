@@ -14,7 +14,7 @@ from robotdiffuse.core.kernels import kernel
 from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.surface_points import VisibleRegion
 
-# Maximum number of samples for each requested point; those outside the region are dropped.
+# Largest number of samples that are drawn for each requested point; samples outside the region are dropped.
 _OVERSAMPLING = 8
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
@@ -23,6 +23,7 @@ _HALF = np.float32(0.5)
 _QUARTER = np.float32(0.25)
 _FOUR = np.float32(4.0)
 _PI = np.float32(np.pi)
+# Turn 24 random bits, as many as a float32 holds exactly, into a number from 0 to 1.
 _UNIT = np.float32(2.0**-24)
 _MASK = np.uint64(2**24 - 1)
 
@@ -40,7 +41,7 @@ def surface_clouds(
     """`count` points on the obstacles of each scene [m], independent and uniform by area.
 
     The result is on the generator's device. If too few samples are inside the region, points are repeated;
-    the cloud of a scene without any is all zeros.
+    if none is, the scene's cloud is all zeros.
 
     region: only points inside it.
     ordered: sorted by x, then y, then z, for encoders that depend on the order.
@@ -73,10 +74,11 @@ def _next(x):
 
 @kernel(nogil=True, error_model="numpy")
 def fill_clouds(kinds, params, seeds, region, out):
-    """Writes points that are uniform by area over the shapes of each scene to out[n, count, 3].
+    """Writes points inside the region, uniform by area over the shapes of each scene, to out[n, count, 3].
 
-    Scenes without shapes get zeros. kinds: [n, k], and params: [n, k, 10], as in `PackedScenes`. seeds:
-    uint64[n]. region: x, y and z of its center, its reach and its floor [m].
+    If samples inside are too few, points are repeated; if there are none, zeros are written. kinds: [n, k],
+    and params: [n, k, 10], as in `PackedScenes`. seeds: uint64[n]. region: x, y and z of its center, its
+    reach and its floor [m].
     """
     n, k = kinds.shape
     count = out.shape[1]
@@ -142,8 +144,8 @@ def fill_clouds(kinds, params, seeds, region, out):
 
 @kernel(error_model="numpy")
 def _prepare(kind, row, faces, axes):
-    """Area of a shape [m^2]. Writes to `axes` the shape's axes times its sizes, and to `faces` the cumulative
-    areas of the first one and two pairs of a box's faces."""
+    """Area of a shape [m²]. Writes to `axes` the shape's axes times its sizes, and to `faces` the area of the
+    first pair of a box's opposite faces, and of the first two pairs together."""
     if kind == NONE:
         return _ZERO
     if kind == SPHERE:
@@ -168,14 +170,14 @@ def _prepare(kind, row, faces, axes):
 @kernel()
 def _may_intersect(region, row, axes):
     """Whether the bounding box of a shape reaches into the region."""
-    gap = _ZERO
+    squared_gap = _ZERO
     half = _ZERO
     for r in range(3):
         half = _HALF * (abs(axes[r, 0]) + abs(axes[r, 1]) + abs(axes[r, 2]))
         away = max(abs(row[r] - region[r]) - half, _ZERO)
-        gap += away * away
+        squared_gap += away * away
     # `half` is now half the box's height
-    return row[2] + half > region[4] and gap < region[3] * region[3]
+    return row[2] + half > region[4] and squared_gap < region[3] * region[3]
 
 
 @kernel(inline="always")

@@ -149,7 +149,7 @@ class Evaluation:
 
 class RowResult(NamedTuple):
     name: str
-    alone: Evaluation
+    unguided: Evaluation
     """Evaluation without guidance."""
     guided: Evaluation
     """Evaluation with guidance."""
@@ -159,7 +159,7 @@ class RowResult(NamedTuple):
 
     @property
     def as_in_paper(self) -> Evaluation:
-        return self.guided if (ROWS | CONTROLS)[self.name].guided else self.alone
+        return self.guided if (ROWS | CONTROLS)[self.name].guided else self.unguided
 
 
 def run_ablation(
@@ -209,12 +209,12 @@ def run_ablation(
     results = []
     for name in rows:
         row = ROWS[name]
-        alone, guided = (
-            [evaluations[Training(row.config, seed), guided] for seed in range(settings.seeds)]
-            for guided in (False, True)
+        unguided, guided = (
+            [evaluations[Training(row.config, seed), with_guidance] for seed in range(settings.seeds)]
+            for with_guidance in (False, True)
         )
-        by_seed = tuple(float(x.single.mean()) for x in (guided if row.guided else alone))
-        results.append(RowResult(name, Evaluation.mean(alone), Evaluation.mean(guided), by_seed))
+        by_seed = tuple(float(x.single.mean()) for x in (guided if row.guided else unguided))
+        results.append(RowResult(name, Evaluation.mean(unguided), Evaluation.mean(guided), by_seed))
     controls = [RowResult(name, evaluations[name, False], evaluations[name, True]) for name in CONTROLS]
     return [*results, *controls]
 
@@ -238,7 +238,7 @@ def _training(file: FilePath, name: str, budget: int) -> dict[str, Any]:
     samples = about["settings"]["samples"]
     if samples != budget:
         raise InputError(
-            f"{file.parent} was trained with {name} {samples}, now it is {budget}; use another folder, "
+            f"{file.parent} was trained with {name} {samples}, not {budget}; use another folder, "
             "or the same budget"
         )
     return about
@@ -354,7 +354,7 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
             Mean.of(evaluation.length).value,
             Mean.of(evaluation.length / first.length).value,
             float(np.median(evaluation.seconds)),
-            _share(result.alone.single),
+            _share(result.unguided.single),
             *((by_seed,) if several_seeds else ()),
             *paper,
         )

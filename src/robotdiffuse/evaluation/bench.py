@@ -226,7 +226,7 @@ def _warm_up(record: Fields) -> None:
         for result in _planner.warm_up(problem):
             if result.path is not None and result.trajectory is not None:
                 measured(problem.robot, result.path, result.trajectory, result)
-    except (Exception, SystemExit):  # the timed call will report it
+    except (Exception, SystemExit):  # the timed call will meet this error too, and report it
         traceback.print_exc()
 
 
@@ -560,7 +560,7 @@ def preset_settings(
         preset: Name of the preset.
         out: Folder for problems and results.
         problems: Problem sets in addition to those of the preset.
-        count: Largest number of problems of each set; None: the preset's number.
+        count: Number of problems of each set, at most that of the preset; None: that of the preset.
         more: Further `BenchSettings`.
 
     Raises:

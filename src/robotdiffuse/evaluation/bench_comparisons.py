@@ -41,10 +41,10 @@ LIMITS = (0.1, 1.0, 10.0, 60.0)
 longest limit of the records."""
 NONTRIVIAL_LABEL = ", non-trivial"
 LATE_SHARE = 0.1
-"""A motion still counts if it is late by at most this fraction of the time limit, or by LATE_SECONDS:
-planners stop searching in time, but validation of the motion follows."""
+"""If a call returns a path after its time limit, late by at most this fraction of the limit, the path still
+counts: planners stop searching in time, but validation of the motion follows."""
 LATE_SECONDS = 0.05
-"""See LATE_SHARE [s]."""
+"""For short time limits, such a path may be late by this [s] instead."""
 RAN_OUT = "time ran out"
 GAVE_UP = "gave up before"
 LATER = "found one later"
@@ -57,11 +57,11 @@ FAILURES = (
 """Reasons of failures, in the order of tables:
 
 - time ran out: there was no path at the end of the limit.
-- gave up before: the planner ended without a path long before the limit.
+- gave up before: the planner ended without a path before 90 % of the limit.
 - found one later: the planner found a path after the limit.
 - scene collision, self-collision: the validator refused the last path for this reason.
 - other refusal: the validator refused the last path for another reason, such as limits or a missed goal.
-- ends refused: start or goal were invalid.
+- ends refused: the start or the goal was invalid, or the goal unreachable.
 - crashed: the planner's process died.
 - overran: the process did not answer and was killed.
 - exception: the planner raised an exception.
@@ -110,7 +110,7 @@ def base_name(planner: str) -> str:
 
 
 def read_bench(folder: FilePath, planners: Sequence[str] | None = None) -> Bench:
-    """Read the records of all planners, or of the given planners, including those with restarts.
+    """Read the records of all planners, or of the given planners, including their records with restarts.
 
     Raises InputError for a folder without a bench, damaged files and planners without records.
     """
@@ -162,8 +162,8 @@ class Outcome:
         return self.found < np.inf
 
     def full(self, limit: float, shortest: float) -> bool:
-        """Whether the planner used up the limit [s], or no shorter path exists. `shortest` is the length of
-        the shortest path of any planner [rad]."""
+        """Whether the planner used up the limit [s], possibly with restarts, or no shorter path exists.
+        `shortest` is the length of the shortest path of any planner [rad]."""
         nothing_shorter = self.record.trivial and self.joint_length <= SHORTEST_FACTOR * shortest
         return self.record.restarts is not None or self.returned >= ENDED_EARLY * limit or nothing_shorter
 
@@ -228,11 +228,11 @@ class Mean(NamedTuple):
     @classmethod
     def of(cls, values: Iterable[float | None]) -> "Mean":
         """The mean of the values, leaving out None and NaN."""
-        finite = np.array([value for value in values if value is not None and value == value])
-        if not len(finite):
+        known = np.array([value for value in values if value is not None and value == value])
+        if not len(known):
             return cls(np.nan, np.nan)
-        half = 1.96 * float(finite.std(ddof=1)) / len(finite) ** 0.5 if len(finite) > 1 else np.nan
-        return cls(float(finite.mean()), half)
+        half = 1.96 * float(known.std(ddof=1)) / len(known) ** 0.5 if len(known) > 1 else np.nan
+        return cls(float(known.mean()), half)
 
     def cell(self, metric: Metric) -> Figure | None:
         """The cell of a table: the mean of a metric with its interval; None without a mean."""
@@ -249,10 +249,10 @@ class Row:
     outcomes: tuple[Outcome, ...]
     """Outcomes of all problems and seeds of the table."""
     figures: Indicators
-    """The paper's four indicators. The length is the mean over the solved problems, NaN if no problem is
-    solved. The time is the mean until the planner returns; an unsolved problem counts with the time limit."""
+    """The paper's four indicators. The length is the mean over the solved calls, NaN if there are none. The
+    time is the mean until the planner returns; an unsolved call counts with the time limit."""
     comscore: float
-    """ComScore, normalized over the rows of this table; NaN with restarts."""
+    """ComScore, normalized over the rows without restarts of this table; NaN with restarts."""
     paired: Paired | None
     """Comparison with the reference planner by joint-space lengths; None for the reference itself, and if the
     reference has no results."""
@@ -277,7 +277,7 @@ class Row:
         return Counter(o.failure for o in self.outcomes if not o.solved)
 
     def mean(self, metric: Metric) -> Figure | None:
-        """The mean of a metric over the solved problems; that of a problem is the mean over its motions."""
+        """The mean of a metric over the solved problems; a problem's value is the mean over its motions."""
         motions = defaultdict[str, list[float | None]](list)
         for o in self.solved:
             motions[o.record.name].append(o.record.measures.get(metric.name))
@@ -337,12 +337,12 @@ class Curve:
     found: Values
     """Times of first paths [s], sorted."""
     times: Values
-    """Times at which the median ratio is finite: at least half of the problems of `ratios` are solved by then
+    """Times at which the median ratio is finite: more than half of the calls of `ratios` have a path by then
     [s]."""
     ratios: Values
-    """At each of `times`, the median over problems of the ratio of joint-space length to the best known
-    length. The problems are the non-trivial ones that the planner solves by `end`; before it solves a
-    problem, the ratio is infinite."""
+    """At each of `times`, the median over calls of the ratio of joint-space length to the best known length.
+    The calls are those on non-trivial problems that find a path by `end`; until a call finds one, its ratio
+    is infinite."""
 
 
 @dataclass(frozen=True)
@@ -367,7 +367,8 @@ def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Sectio
     non-trivial problems that at least one planner solves.
 
     `limits` are the time limits to report [s]; None: the limits of the records, and all LIMITS below the
-    longest of them. Raises InputError if no planner has results for any of the limits.
+    longest of them. Raises InputError if no planner has results for any of the limits, or those that have
+    results share no calls.
     """
     results = []
     for problem_set in bench.problem_sets:
@@ -377,8 +378,8 @@ def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Sectio
         cases = [case.name for case in read_cases(bench.folder, problem_set)]
         places = {name: i for i, name in enumerate(dict.fromkeys([*cases, *names]))}
         if limits is None:
-            recorded = {record.time_limit for record in records}
-            chosen = recorded | {limit for limit in LIMITS if limit < max(recorded)}
+            record_limits = {record.time_limit for record in records}
+            chosen = record_limits | {limit for limit in LIMITS if limit < max(record_limits)}
         else:
             chosen = set(limits)
         parts = {problem_set: set(names)}
@@ -398,7 +399,8 @@ def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Sectio
                 results.append(Section(name, problem_set, with_rows, curves(part)))
     if not results:
         raise InputError(
-            f"limits are {', '.join(f'{x:g}' for x in limits or ())} s; no planner was run that long"
+            f"limits are {', '.join(f'{x:g}' for x in limits or ())} s; no planner was run that long, or the "
+            "planners share no problem"
         )
     return results
 
@@ -408,8 +410,9 @@ def _counted(
 ) -> dict[Key, Record]:
     """The records of a planner that count for a limit.
 
-    If the planner was run with this limit on the first problems only, the other problems are left out. On the
-    other problems, only calls that ended before a shorter limit have results, which would select easy ones.
+    If the planner was run with this limit or a longer one on the first problems only, the others are left
+    out: of them, only calls that ended before a shorter limit have results, so mostly easy problems would
+    count.
     """
     counted = {
         key: record
@@ -460,7 +463,6 @@ def _comparison(
         for results in zip(*outcomes.values(), strict=True)
     ]
     reference = lengths.get(bench.reference)
-    names = {name for name, _ in keys}
     rows = []
     for planner, results in outcomes.items():
         timed = {f"run {o.record.run or '?'}, {o.record.workers or '?'} at once" for o in results}
@@ -479,11 +481,13 @@ def _comparison(
     )
     missing = tuple(name for name in calls if name not in outcomes)
     seeds = len({seed for _, seed in keys})
-    return Comparison(limit, len(names), problems, seeds, tuple(rows), missing, tuple(keys), loads)
+    return Comparison(
+        limit, len({name for name, _ in keys}), problems, seeds, tuple(rows), missing, tuple(keys), loads
+    )
 
 
 def _indicators(outcomes: Sequence[Outcome]) -> Indicators:
-    """The paper's four indicators of all calls; the length is over the solved problems."""
+    """The paper's four indicators of all calls; the length is over the solved calls."""
     return Indicators(
         success=100 * float(np.mean([o.solved for o in outcomes])),
         collision=100 * float(np.mean([o.record.in_collision for o in outcomes])),
