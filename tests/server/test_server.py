@@ -154,7 +154,7 @@ def test_a_batch_is_answered_line_by_line_in_order(server: httpx.Client) -> None
         ("/verify", {"problem": problem()}, 400, "neither path nor trajectory"),
         ("/verify", {"problem": problem(), "path": {"joint_names": JOINTS}}, 400, "path has no positions"),
         ("/verify", {"problem": problem(), "path": FAR}, 400, "its numbers must be finite and within"),
-        ("/plan", b" " * (2**21 + 1), 413, "it may have 2097152 bytes"),
+        ("/plan", b" " * (2**21 + 1), 413, "it may have at most 2097152 bytes"),
         ("/plan", {"problem": problem(constraints=[CONE] * 5000)}, 400, "constraints has 5000 entries; .* 50$"),
         ("/plan", {"problem": problem(waypoints=[GOAL] * 1000)}, 400, "waypoints has 1000 entries; .* 200$"),
         ("/plan", {"problem": problem(goal={"any": [GOAL] * 2000})}, 400, "goal has 2000 entries; .* 1000$"),

@@ -80,9 +80,11 @@ def with_mimics(joints: tuple[Joint, ...], locked: dict[str, Any]) -> dict[str, 
 
     def value(name: str) -> Any:
         mimic = by_name[name].mimic if name in by_name else None
-        leader = None if mimic is None else value(mimic.joint)
+        followed = None if mimic is None else value(mimic.joint)
         return (
-            locked.get(name) if mimic is None or leader is None else mimic.multiplier * leader + mimic.offset
+            locked.get(name)
+            if mimic is None or followed is None
+            else mimic.multiplier * followed + mimic.offset
         )
 
     values = {name: value(name) for name in (*locked, *(joint.name for joint in joints if joint.mimic))}
@@ -205,13 +207,14 @@ class KinematicTree(Value):
         return read_only(np.array([joint.kind == "continuous" for joint in self.planned_joints], dtype=bool))
 
     def whole_turns(self, q: JointArray) -> JointArray:
-        """The multiples of 2 pi to subtract so that continuous joints are within [-pi, pi]; 0 for others."""
+        """The multiples of 2 pi to subtract so that continuous joints are within [-pi, pi]; 0 for other
+        joints."""
         return np.where(self.continuous, TURN * np.round(q / TURN), 0.0)
 
     def wraps(self, q: Configurations) -> Configurations:
         """For each step of a continuous joint from row to row, the nearest multiple of 2 pi if the step
-        differs from it by less than MAX_WRAPPED_STEP, else 0 [rad]. Such steps occur where values are wrapped
-        to [-pi, pi]."""
+        differs from this multiple by less than MAX_WRAPPED_STEP, else 0 [rad]. Steps near a whole turn occur
+        where values are wrapped to [-pi, pi]."""
         steps = np.diff(q, axis=0)
         turns = self.whole_turns(steps)
         return np.where(np.abs(steps - turns) < MAX_WRAPPED_STEP, turns, 0.0)
@@ -233,10 +236,10 @@ class KinematicTree(Value):
         nearest = self._turned(q, start, several_turns)
         rows = [nearest]
         for j in np.flatnonzero(several_turns):
-            image = nearest.copy()
-            image[j] -= np.copysign(TURN, nearest[j] - start[j])
-            if self.lower[j] <= image[j] <= self.upper[j]:
-                rows.append(image)
+            other_way = nearest.copy()
+            other_way[j] -= np.copysign(TURN, nearest[j] - start[j])
+            if self.lower[j] <= other_way[j] <= self.upper[j]:
+                rows.append(other_way)
         return np.stack(rows)
 
     def nearest_turns(self, q: Configurations, start: Configuration) -> Configurations:
@@ -245,8 +248,8 @@ class KinematicTree(Value):
         return self._turned(q, start, self._more_than_a_turn | self.continuous)
 
     def _turned(self, q: ndarray, start: ndarray, joints: JointMask) -> ndarray:
-        """The configurations with whole turns added to these joints, to be as close to `start` as the limits
-        allow."""
+        """The configurations with whole turns added to the masked joints, to be as close to `start` as the
+        limits allow."""
         if not joints.any():
             return q
         limited = joints & ~self.continuous
@@ -261,6 +264,7 @@ class KinematicTree(Value):
 
     @cached_property
     def _frames(self) -> tuple[dict[str, tuple[int, ndarray]], ndarray, ndarray]:
+        """The frame index and T_frame_link of each link, `frame_offsets`, and `parents`."""
         links: dict[str, tuple[int, ndarray]] = {self.base: (0, np.eye(4))}
         offsets = np.zeros((self.dof, 4, 4))
         parents = np.zeros(self.dof, np.int64)
@@ -279,6 +283,7 @@ class KinematicTree(Value):
 
     @cached_property
     def frame_offsets(self) -> Float[ndarray, "dof 4 4"]:
+        """Pose of the frame of each planned joint in its parent frame, at joint value 0."""
         return self._frames[1]
 
     @cached_property
@@ -342,7 +347,7 @@ class KinematicTree(Value):
         if link not in self.link_names:
             raise unknown_name(f"link in {field}:", link, moved)
         if link not in moved:
-            raise InputError(f"{field}: no planned joint moves {link!r}; they move {', '.join(moved)}")
+            raise InputError(f"{field}: no planned joint moves {link!r}; moved links: {', '.join(moved)}")
 
     def planned_values(self, where: str, values: Mapping[str, Any], advice: str = "") -> list[Any]:
         """The values of the planned joints in order. Raises InputError if some are missing; its message

@@ -11,8 +11,8 @@ from robotdiffuse.robots.kinematic_tree import KinematicTree, once_per_robot
 REACH_SAMPLES = 4096
 """Number of random configurations at which the reach is measured."""
 REACH_QUANTILE = 0.99
-"""The reach is this quantile of the tip's distances, since the very largest ones are rare and vary with the
-sample."""
+"""The reach is this quantile of the tip's distances from the shoulder, since the very largest distances are
+rare and vary with the sample."""
 
 
 def link_pose(robot: KinematicTree, q: Configuration, link: str) -> Pose:

@@ -138,7 +138,8 @@ class Robot(KinematicTree):
     notes: tuple[str, ...] = ()
     """Notes on what was changed or ignored when the URDF was read."""
     root: str = ""
-    """Root link of the URDF; if empty, the base is the root."""
+    """Root link of the URDF, or the link after its mobile base (see `UrdfTree.pose_link`); if empty, the
+    base."""
     above: dict[str, Pose] = field(default_factory=dict)
     """T_base_link of the links between the root of the URDF and the base that are rigidly connected to the
     base. The root is one of them unless a movable joint lies between the root and the base."""
@@ -222,14 +223,15 @@ class Robot(KinematicTree):
             pose: T_base_link [4, 4].
             link: Name of the link; None: the tip of the robot.
             count: Largest number of configurations.
-            near: A configuration [dof]; results are sorted by their distance from it.
+            near: A configuration [dof]; results are sorted by their distance from `near`.
             seed: Seed of the random starts.
 
         Returns:
             Distinct configurations [k, dof]; no rows if the pose was not reached.
 
         Raises:
-            InputError: For an unknown link, and for a pose that is not rigid.
+            InputError: For an unknown link, a link that no planned joint moves, a pose that is not rigid, a
+                count below 1, or a wrong `near`.
 
         Examples:
             >>> robot = rd.load_robot("panda")
@@ -260,8 +262,8 @@ class Robot(KinematicTree):
     def with_locked(self, locked: dict[str, float]) -> "Robot":
         """Lock joints at values. Joints that mimic them follow.
 
-        Values beyond the URDF's limits are accepted up to the joint's range, since some published problems
-        open grippers that far. Calls with equal values return the same object.
+        Values may exceed the URDF's limits by up to the joint's range, since some published problems open
+        grippers that far. Calls with equal values return the same object.
 
         Args:
             locked: Values [rad] or [m] by joint name. Planned joints may be locked as well.
@@ -271,7 +273,7 @@ class Robot(KinematicTree):
 
         Raises:
             InputError: For an unknown or fixed joint, a value that is not finite or is farther beyond a limit
-                than the joint's range, or a value of a mimic joint that contradicts its leader.
+                than the joint's range, or a value of a mimic joint that contradicts the joint that it mimics.
         """
         movable = {joint.name: joint for joint in self.joints if joint.kind in MOVING_KINDS}
         for name, value in locked.items():
@@ -315,7 +317,7 @@ class Robot(KinematicTree):
 
         Args:
             shape: The object, at its pose in the frame of `link`. A curved shape is replaced by a polyhedron
-                around it, which is larger by at most 2 % of the radius.
+                around it, which extends beyond the shape by at most 2.5 % of the radius.
             link: The link that holds the object.
             touch_links: Further links that the object may touch.
 
@@ -323,8 +325,8 @@ class Robot(KinematicTree):
             The robot with the object.
 
         Raises:
-            InputError: For unknown links, a link that no planned joint moves, a name that is taken, and a
-                point cloud.
+            InputError: For unknown links, a link that no planned joint moves, a name that a link already has,
+                a point cloud, and a height map.
 
         Examples:
             >>> cup = rd.Cylinder([0, 0, 0.125], radius=0.03, height=0.1, name="cup")
@@ -346,7 +348,7 @@ class Robot(KinematicTree):
     ) -> "Robot":
         """Add a tool: a frame that goals may name, and shapes that are part of the arm.
 
-        The tool becomes the tip if no planned joint comes after its link.
+        The tool becomes the tip of its arm if no planned joint comes after `link`.
 
         Args:
             link: The link that carries the tool.
@@ -506,8 +508,8 @@ def _with_body(robot: Robot, body: AttachedBody) -> Robot:
 
 
 def scaled(robot: Robot, scale: float) -> Robot:
-    """The arm without attached bodies, scaled by a factor: joint offsets, limits and locked values of
-    prismatic joints, spheres, convex meshes and `above`. All else is unchanged, including inertias, named
+    """The arm without attached bodies, scaled by a factor: joint offsets, position limits and locked values
+    of prismatic joints, spheres, convex meshes and `above`. All else is unchanged, including inertias, named
     poses and surfaces."""
     arm = robot.arm
     prismatic = {joint.name for joint in arm.joints if joint.kind == "prismatic"}
@@ -515,7 +517,7 @@ def scaled(robot: Robot, scale: float) -> Robot:
     def sized(joint: Joint) -> Joint:
         by = scale if joint.name in prismatic else 1.0
         limits = {name: by * getattr(joint, name) for name in ("lower", "upper")}
-        return replace(joint, T_parent_joint=_moved(joint.T_parent_joint, scale), **limits)
+        return replace(joint, T_parent_joint=_with_scaled_position(joint.T_parent_joint, scale), **limits)
 
     return replace(
         arm,
@@ -526,11 +528,11 @@ def scaled(robot: Robot, scale: float) -> Robot:
             for link, meshes in arm.meshes.items()
         },
         locked={name: (scale if name in prismatic else 1.0) * value for name, value in arm.locked.items()},
-        above={link: _moved(T, scale) for link, T in arm.above.items()},
+        above={link: _with_scaled_position(T, scale) for link, T in arm.above.items()},
     )
 
 
-def _moved(T: Pose, scale: float) -> Pose:
+def _with_scaled_position(T: Pose, scale: float) -> Pose:
     moved = T.copy()
     moved[:3, 3] *= scale
     return moved
@@ -559,10 +561,10 @@ def named_pose(robot: Robot, field: str, name: str) -> list[float]:
     """
     complete = [pose for pose, values in robot.poses.items() if {*robot.joint_names} <= values.keys()]
     if not complete:
-        values = f"a list of {robot.dof} numbers: {', '.join(robot.joint_names)}"
+        expected = f"a list of {robot.dof} numbers: {', '.join(robot.joint_names)}"
         raise InputError(
-            f"{field} is {shown(name)}; it must be {values} ({robot.name} has no named pose with values for "
-            "all planned joints)"
+            f"{field} is {shown(name)}; it must be {expected} ({robot.name} has no named pose with values "
+            "for all planned joints)"
         )
     if name not in robot.poses:
         raise unknown_name(f"pose in {field}:", name, complete)

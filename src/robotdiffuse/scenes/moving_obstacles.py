@@ -27,7 +27,8 @@ MAX_POINT_SPEED = 100.0
 """Largest allowed speed of a point of an obstacle [m/s]; a faster motion between two poses counts as a
 jump."""
 MAX_DURATION = 1e5
-"""Duration for which a constant velocity lasts [s], about a day: longer motions are not validated."""
+"""Duration for which a constant velocity lasts, and largest absolute value of `times` [s]: about a day. The
+validator refuses longer motions."""
 RIGID_SLACK = 1e-6
 """Largest deviation of a pose from a rigid transform."""
 POSE_TOLERANCE = 1e-6
@@ -50,7 +51,7 @@ class MovingObstacle(Value):
 
     Raises:
         InputError: Unless exactly one motion is given: velocity, times and poses, or max_speed; for wrong
-            values; and for poses that jump, where a point is faster than 100 m/s.
+            values; and for poses that jump, so that a point may be faster than 100 m/s.
     """
 
     shape: Shape
@@ -215,7 +216,7 @@ class MovingObstacle(Value):
 
 
 def track_speeds(times: Values, poses: Poses, radius: float) -> Float[ndarray, "intervals"]:
-    """Upper bounds on the speed between successive times [m/s], for points up to `radius` [m] from the origin
+    """Upper bounds on the speed between successive times [m/s], for points within `radius` [m] of the origin
     of the moving frame."""
     distances_between = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     turns = [rotation_angle(a.T @ b) for a, b in zip(poses[:-1, :3, :3], poses[1:, :3, :3], strict=True)]

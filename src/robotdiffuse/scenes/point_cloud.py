@@ -107,10 +107,10 @@ def _shell(level: int) -> Points:
     n = 2**level
     if 6 * n**2 > MAX_VOXELS:
         raise InputError(f"the tree has more than {MAX_VOXELS:,} occupied voxels")
-    at = np.arange(n) - (n - 1) / 2
-    ends = np.unique(at[[0, -1]])
-    interior = at[1:-1]
-    blocks = [(ends, at, at), (interior, ends, at), (interior, interior, ends)]
+    coordinates = np.arange(n) - (n - 1) / 2
+    ends = np.unique(coordinates[[0, -1]])
+    interior = coordinates[1:-1]
+    blocks = [(ends, coordinates, coordinates), (interior, ends, coordinates), (interior, interior, ends)]
     return np.concatenate([np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3) for axes in blocks])
 
 
@@ -132,10 +132,10 @@ def voxel_thin(points: Points, voxel: float) -> Points:
     extent = cells.max(axis=0) + 1
     bits = len(points).bit_length()
     if extent.prod() * 2.0**bits < 2.0**62 and extent.prod() < 2.0**53:
-        # Cell and point numbers are packed into one integer: sorting these is several times faster than
-        # np.unique.
-        cell = (cells @ np.array([extent[1] * extent[2], extent[2], 1.0])).astype(np.int64)
-        packed = np.sort((cell << bits) | np.arange(len(points)))
+        # Cell and point numbers are packed into one integer: sorting such integers is several times faster
+        # than np.unique.
+        cell_number = (cells @ np.array([extent[1] * extent[2], extent[2], 1.0])).astype(np.int64)
+        packed = np.sort((cell_number << bits) | np.arange(len(points)))
         first = np.flatnonzero(np.diff(packed >> bits, prepend=-1))
         first_indices = packed[first] & ((1 << bits) - 1)
     else:

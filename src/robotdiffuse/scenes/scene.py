@@ -102,7 +102,7 @@ class Scene(Value):
             replaced by their convex hulls, as MuJoCo does.
 
         Raises:
-            InputError: For an unknown body, and for height fields and signed distance fields.
+            InputError: For an unknown body, and for soft bodies, height fields and signed distance fields.
         """
         return cls(_mujoco_shapes(model, data, base))
 
@@ -127,7 +127,7 @@ class Scene(Value):
             shapes: The obstacles of the new scene.
 
         Returns:
-            A scene with these shapes, and with the allowed contacts of those whose names this scene has.
+            A scene with these shapes. Allowed contacts of this scene are kept for shapes of the same name.
 
         Raises:
             InputError: For values that are not shapes.
@@ -198,7 +198,7 @@ class Scene(Value):
             The scene with the object, and the robot without the object.
 
         Raises:
-            InputError: For an unknown name.
+            InputError: For an unknown name, and for an object to which a body is attached.
         """
         robot_without = robot.detach(name)
         [body] = [body for body in robot.attached if body.name == name]
@@ -218,8 +218,8 @@ def contact_notes(scene: Scene) -> tuple[str, ...]:
 def _contacts(
     allowed: object, names_of: dict[str, list[str]], names: set[str]
 ) -> tuple[tuple[str, tuple[str, ...] | str], ...]:
-    """Checks allowed contacts and returns `Scene.allowed_contacts`. `names_of`: for each name
-    that shapes were given, the unique names of these shapes."""
+    """Checks allowed contacts and returns `Scene.allowed_contacts`. `names_of`: for each name that shapes
+    were given, the unique names of these shapes. `names`: all unique names."""
     try:
         entries = allowed.items() if isinstance(allowed, Mapping) else [(a, b) for a, b in allowed]  # type: ignore
     except (TypeError, ValueError):
@@ -262,10 +262,10 @@ def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
         placed.mocap_pos[:] = data.mocap_pos
         placed.mocap_quat[:] = data.mocap_quat
     mujoco.mj_kinematics(model, placed)
-    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, base)
-    if body < 0:
+    base_body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, base)
+    if base_body < 0:
         raise unknown_name("body", base, [model.body(k).name for k in range(model.nbody)])
-    T_base_world = inverse(transform(placed.xpos[body], placed.xmat[body].reshape(3, 3)))
+    T_base_world = inverse(transform(placed.xpos[base_body], placed.xmat[base_body].reshape(3, 3)))
     robot_bodies = set(mjcf.robot_bodies(model))
     colliding = model.geom_contype | model.geom_conaffinity
     shapes: list[Shape] = []

@@ -46,8 +46,8 @@ class PackedScenes:
         """Packs scenes, with room for `slots` shapes in each. With `floor`, the first shape of each scene is
         its floor.
 
-        Raises InputError for shapes other than spheres and boxes, and for scenes with more than `slots`
-        shapes.
+        Raises InputError for shapes other than spheres and boxes, for scenes with more than `slots` shapes
+        (the floor not counted), and for floors that are not boxes without rotation.
         """
         kinds = np.full((len(scenes), slots), NONE, np.int8)
         params = np.zeros((len(scenes), slots, PARAMETERS), np.float32)
@@ -71,7 +71,7 @@ class PackedScenes:
 
     @staticmethod
     def joined(parts: Sequence["PackedScenes"]) -> "PackedScenes":
-        """All scenes of several PackedScenes, in order. Either all of them or none must have floors."""
+        """All scenes of several PackedScenes, in order. Either all parts or none must have `floors`."""
         kinds, params = (np.concatenate([getattr(p, name) for p in parts]) for name in ("kinds", "params"))
         floors = [p.floors for p in parts if p.floors is not None]
         return PackedScenes(kinds, params, np.concatenate(floors) if floors else None)
@@ -111,7 +111,8 @@ class PackedScenes:
 
 
 def floor_row(floor: Shape | None) -> Float[ndarray, "6"]:
-    """A row of `PackedScenes.floors`. Raises InputError unless the floor is a box without rotation."""
+    """A row of `PackedScenes.floors`; zeros for None. Raises InputError unless the floor is a box without
+    rotation."""
     if floor is None:
         return np.zeros(6)
     if not isinstance(floor, Box) or floor.wxyz[0] != 1:

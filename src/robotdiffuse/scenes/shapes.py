@@ -83,7 +83,7 @@ class Shape(Value, ABC):
     def solid(self) -> tuple[Pose, tuple[ConvexMesh, ...]]:
         """Enclose the shape in convex meshes, for a robot that holds it.
 
-        The mesh of a box is exact; round shapes are enclosed by a polyhedron.
+        The mesh of a box is exact; round shapes are enclosed by a polyhedron, and meshes by convex parts.
 
         Returns:
             T_base_shape [4, 4], and the meshes in the shape's own frame.
@@ -91,7 +91,7 @@ class Shape(Value, ABC):
         Raises:
             InputError: For point clouds and height maps.
         """
-        from robotdiffuse.scenes.convex_solids import SOLIDS  # SciPy, which few problems need
+        from robotdiffuse.scenes.convex_solids import SOLIDS  # imports SciPy, which few problems need
 
         if self.kind not in SOLIDS:
             raise self._not_solid()
@@ -475,6 +475,7 @@ class Mesh(_Posed, Triangulated):
 
     @cached_property
     def world_vertices(self) -> Points:
+        """The vertices in the frame of the robot's base [m]."""
         return read_only(self.vertices @ self.rotation.T + self.xyz)
 
     @cached_property
@@ -523,8 +524,8 @@ class HeightMap(_Posed, Triangulated):
             raise InputError(
                 f"height_map.heights is {form(heights)}; it must be rows x columns, at least 2 x 2"
             )
-        finite = np.abs(heights[~np.isnan(heights)])
-        if not (finite <= MAX_COORDINATE).all():
+        absolute = np.abs(heights[~np.isnan(heights)])
+        if not (absolute <= MAX_COORDINATE).all():
             raise InputError(f"height_map.heights has numbers that are not within ±{MAX_COORDINATE:g} m")
         object.__setattr__(self, "heights", heights)
         super().__post_init__()

@@ -18,8 +18,8 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
 
 MAX_SAMPLING_ROUNDS = 6
-"""Largest number of rounds in which `sample_surface` draws points. If these are too few, it repeats
-points."""
+"""Largest number of rounds in which `sample_surface` draws points. If the points are still too few, they are
+repeated."""
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,8 @@ def sample_surface(
 ) -> Float[ndarray, "count 3"]:
     """`count` points on the shapes, in random order, uniform by area within the region [m].
 
-    Points repeat if only a small part of the surface is in the region. The array has shape (0, 3) if no part
-    of the surface is in it.
+    Points repeat if only a small part of the surface is in the region. The array has shape (0, 3) if no point
+    that was drawn is in the region.
     """
     shapes = [shape for shape in scene.shapes if shape.area > 0 and _may_intersect(shape, region)]
     if not shapes or count == 0:

@@ -240,29 +240,29 @@ class Access:
         began = time.monotonic()
         code = CLIENT_GONE
         request = Request(scope)
-        # The server closes the connection of a client that asks for it after the answer. A client that is
-        # still sending would lose the answer, so the rest of its request is read before.
+        # If a client asks for it, the server closes the connection after the answer. A client that is still
+        # sending would then lose the answer, so the rest of its request is read first.
         unread = request.headers.get("connection", "").lower() == "close"
 
-        async def counting() -> Message:
+        async def receiving() -> Message:
             nonlocal unread
             message = await receive()
             unread = unread and message.get("more_body", False)
             return message
 
-        async def noting(message: Message) -> None:
+        async def sending(message: Message) -> None:
             nonlocal code
             if message["type"] == "http.response.start":
                 code = message["status"]
                 while unread and code >= 400:
-                    await counting()
+                    await receiving()
             await send(message)
 
         try:
-            await (self._refusal(request) or self.app)(scope, counting, noting)
-        except asyncio.CancelledError:  # by the second signal
+            await (self._refusal(request) or self.app)(scope, receiving, sending)
+        except asyncio.CancelledError:  # the second SIGINT or SIGTERM stops the server at once
             if code == CLIENT_GONE:  # no answer has begun
-                await _error(503, STOPPING)(scope, receive, noting)
+                await _error(503, STOPPING)(scope, receive, sending)
         finally:
             name = request.headers.get(REQUEST_ID, "")
             target = f"{scope['method']} {scope['raw_path'].decode('latin-1')}"
@@ -302,7 +302,7 @@ def make_app(pool: WorkerPool, robots: dict[str, Robot]) -> FastAPI:
 
 def _describe_bodies(app: FastAPI) -> None:
     """Complete the OpenAPI description: add the models of bodies that endpoints read themselves, and remove
-    the answer 422 of FastAPI's own validation, which they do not use."""
+    the answer 422 of FastAPI's own validation, which no endpoint uses."""
     _, models = models_json_schema(
         [(PlanBody, "validation"), (VerifyRequest, "validation")], ref_template=REF_TEMPLATE
     )
@@ -460,8 +460,8 @@ def endpoint_list(app: FastAPI) -> str:
 def _cancellable(
     name: str, running: dict[str, Callable[[], None]], tasks: list[asyncio.Task[Answer]]
 ) -> Iterator[None]:
-    """Within the block, the tasks of a request can be cancelled by its name. Tasks that the block leaves
-    unfinished are cancelled."""
+    """Within the block, the tasks of a request can be cancelled by the request's name. Tasks that the block
+    leaves unfinished are cancelled. Raises RequestError for a name that is too long or in use."""
 
     def cancel() -> None:
         for task in tasks:
@@ -482,15 +482,15 @@ def _cancellable(
 
 
 async def read_body(request: Request, pool: WorkerPool, kind: str) -> bytes:
-    """The body of a request. Raises RequestError if the body is too large or not of Content-Type `kind`, or
-    if the server is receiving too much data of other requests. `Connection` ends requests that arrive
-    slowly."""
+    """The body of a request. Raises RequestError if the body is too large or not of Content-Type `kind`, if
+    the server is receiving too much data of all requests together, or if the client disconnects. `Connection`
+    ends requests that arrive slowly."""
     max_size = pool.settings.max_request_size
     content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if content_type != kind:
         raise RequestError(415, f"Content-Type is {shown(content_type)}; it must be {kind}")
     # the connection stays open: many clients lose an answer if it is closed while they are sending
-    too_large = RequestError(413, f"the request is too large: it may have {max_size} bytes")
+    too_large = RequestError(413, f"the request is too large: it may have at most {max_size} bytes")
     length = request.headers.get("content-length", "0")
     if not length.isdecimal() or int(length) > max_size:
         raise too_large

@@ -11,8 +11,8 @@ Triangles = Float[ndarray, "_ 3 3"]
 
 def split(triangles: Triangles, size: "float | Float[ndarray, 'n']", reach: float = np.inf) -> Triangles:
     """Halve triangles at their longest edge until no edge is longer than `size` [m], a number or one per
-    triangle. A triangle is left out if its middle is farther from the origin than `reach` [m] plus its longest
-    edge."""
+    triangle. A triangle is left out if its middle is farther from the origin than its longest edge plus
+    `reach` [m]."""
     sizes = np.broadcast_to(np.asarray(size, np.float64), len(triangles))
     return _split(np.ascontiguousarray(triangles, np.float64), sizes**2, reach)
 

@@ -12,8 +12,8 @@ from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.input_files import is_file
 
 MAX_PACKAGES = 32
-"""Largest number of times that a xacro file is compiled, each time with one more package that was looked
-up."""
+"""Largest number of attempts to compile a xacro file. Each attempt knows one more package, which was looked
+up after the attempt before had failed."""
 NAMESPACE_PREFIX = re.compile(rb"""</?([A-Za-z_][\w.-]*):[\w.-]+|\s([A-Za-z_][\w.-]*):[\w.-]+\s*=\s*["']""")
 """Matches the namespace prefix of an XML element or attribute."""
 XACRO = Lock()
@@ -25,10 +25,10 @@ PACKAGE_NOT_FOUND = re.compile(r"Package not found: (\S+)")
 class Packages(NamedTuple):
     """Finds the ROS packages of a URDF.
 
-    The folder of a package is searched in `folders`, then in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, then in
-    the URDF's folder and all folders above it: one of these with the package's name, or with such a folder in
-    it. Files that the package's folder lacks are searched
-    relative to the URDF's folder and all folders above it, with and without the package's name.
+    The folder of a package is searched in `folders`, then in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, then
+    from the URDF's folder upwards: first a folder with the package's name, then a folder that contains one.
+    Files that the package's folder lacks are searched relative to the URDF's folder and all folders above it,
+    with and without the package's name.
     """
 
     urdf: Path

@@ -53,8 +53,8 @@ class Srdf:
     def joints(self, group: str, joints: tuple[Joint, ...]) -> list[Joint]:
         """The movable joints of a group and of its subgroups, parents before children.
 
-        Raises InputError for an unknown group or joint, and for a chain whose links no joints connect. Single
-        links without a joint above them are ignored.
+        Raises InputError for an unknown group or joint, a group that contains itself, and a chain whose links
+        no joints connect. Single links without a joint above them are ignored.
         """
         named = self._named(group, {joint.child: joint for joint in joints}, ())
         return [joint for joint in joints if joint.name in named and joint.kind in MOVING_KINDS]
@@ -176,8 +176,8 @@ MAX_FINGER_JOINTS = 2
 MAX_HAND_FINGER_JOINTS = 3
 """Largest number of movable joints per finger of a gripper with another number of fingers."""
 MIN_ARM_JOINTS = 4
-"""Smallest number of movable joints of an arm if there are several chains. After this many joints, three or
-more branches form a hand, with any number of joints per finger."""
+"""Smallest number of own joints of an arm (see `Arm.own_joints`) if there are several chains. After this many
+own joints, three or more branches form a hand, with any number of joints per finger."""
 
 
 class Arm(NamedTuple):
@@ -278,9 +278,9 @@ def planned_joints(
     """Names of the joints that are planned unless they are locked, and the tips.
 
     There are several tips if the group has several chains, such as two arms. `joints` are all joints below
-    the base, parents before children. Raises InputError for an unknown tip or group, for a group with joints
-    that do not lead to the given tip, and for a robot with several arms if neither `tip` nor `group` is
-    given.
+    the base, parents before children. Raises InputError for an unknown tip or group, for a group without
+    movable joints or with joints that do not lead to the given tip, and for a robot with several arms if
+    neither `tip` nor `group` is given.
     """
     above = {joint.child: joint for joint in joints}
     if tip is not None and tip not in (base, *above):
@@ -310,7 +310,7 @@ def planned_joints(
 
 def _ends(chosen: list[str], above: dict[str, Joint], written: list[str]) -> list[str]:
     """Tips of a group with the joints `chosen`: the child links of its last joints. A tip that the SRDF gives
-    (`written`) replaces the last link on the way to it."""
+    (`written`) replaces the last of these child links that lies on the way to the tip."""
     last = {joint.child: joint.child for joint in above.values() if joint.name in chosen}
     for link in [*last]:
         for joint in chain(above, link)[:-1]:
@@ -335,7 +335,7 @@ def refuse_linkages(file: Path, robot: Robot) -> None:
         if any(joint in robot.joints_above(link) for link in (*robot.meshes, *robot.tips)):
             raise InputError(
                 f"{file}: joint {joint.name} mimics {leader.name}, which is planned; that is not supported: "
-                f"hold it with --lock {leader.name}=VALUE, or end the arm above it with --tip"
+                f"hold {leader.name} with --lock {leader.name}=VALUE, or end the arm above it with --tip"
             )
 
 

@@ -73,7 +73,7 @@ MAX_LINKS = 500
 MAX_LINK_SIZE = 10.0
 """Size of a link above which a note asks to check the units [m]."""
 MAX_SIZE_PER_REACH = 10.0
-"""A moving link that is larger than the arm's reach by this factor is refused."""
+"""A moving link above MAX_LINK_SIZE is refused if it is larger than the arm's reach by this factor."""
 DEFAULT_VELOCITY = 1.0
 """Velocity limit of movable joints for which the URDF gives none [rad/s] or [m/s]."""
 ACCELERATION_PER_VELOCITY = 4.0
@@ -91,7 +91,7 @@ class UrdfTree:
     folders: dict[str, str | Path]
     """Folders of ROS packages by name."""
     compile_xacro: bool = False
-    """Whether a xacro file is compiled, which runs code in it; otherwise it raises InputError."""
+    """Whether a xacro file is compiled, which runs code in it; if False, a xacro file raises InputError."""
     notes: list[str] = field(default_factory=list)
     semantics: Srdf | None = None
     """Named poses and allowed pairs of a MuJoCo model."""
@@ -148,7 +148,7 @@ class UrdfTree:
             if child in self.parents:
                 raise InputError(
                     f"{self.path}: link {child} has two parent joints ({self.parents[child]}, {name}); a "
-                    f"URDF is a tree: remove one of them, and make the joints that it determined mimic others"
+                    f"URDF is a tree: remove one of them; joints of a loop can follow others by <mimic>"
                 )
             self.parents[child] = name
             self.children.setdefault(parent, []).append(name)
@@ -175,9 +175,9 @@ class UrdfTree:
         """The robot, with convex collision meshes and without spheres.
 
         Planned joints are the movable joints of the group, or all movable joints from base to tip. Passive
-        joints and mimic joints are not planned. All joints that are not planned are locked: at the value in
-        `locked`, else at their value in a rest pose of the SRDF, else at zero clipped to their limits. Locked
-        mimic joints follow the joints that they mimic.
+        joints and mimic joints are not planned, nor are joints with equal limits. All joints that are not
+        planned are locked: at the value in `locked`, else at their value in a rest pose of the SRDF or at
+        zero, clipped to their limits. Locked mimic joints follow the joints that they mimic.
 
         Acceleration and jerk limits, which URDF lacks, are 4 / s times the velocity limit and 10 / s times
         the acceleration limit; `with_limits` changes them. Each collision element becomes a convex hull in
@@ -249,8 +249,8 @@ class UrdfTree:
         return replace(robot, notes=(*robot.notes, *self._size_notes(robot)))
 
     def _size_notes(self, robot: Robot) -> list[str]:
-        """Notes on very large links. Raises InputError for a moving link larger than MAX_SIZE_PER_REACH times
-        the arm's reach."""
+        """Notes on links above MAX_LINK_SIZE. Raises InputError if such a link moves and is larger than
+        MAX_SIZE_PER_REACH times the arm's reach."""
         notes = []
         for link, parts in robot.meshes.items():
             size = float(np.ptp(np.concatenate([part.vertices for part in parts]), axis=0).max())
@@ -267,8 +267,8 @@ class UrdfTree:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the URDF and of its mesh files, equal for equal robots. For a xacro file, the compiled
-        URDF is hashed."""
+        """SHA-256 of the URDF and of the mesh files of its collision geometry. For a xacro file or a MuJoCo
+        model, the URDF that was made from it is hashed."""
         digest = hashlib.sha256(self.text)
         for element in self.links.values():
             for mesh in element.findall(f"{self.kind}/geometry/mesh"):
@@ -324,7 +324,7 @@ class UrdfTree:
         return transforms
 
     def pose_link(self, link: str) -> str:
-        """The link that a scene file places where it gives the robot's pose.
+        """The link whose pose a scene file gives as the pose of the robot.
 
         It is the root, unless the URDF begins with a mobile base without geometry: a planar or floating
         joint, or three joints that move in a plane. Then it is the link after these joints. Only joints from
@@ -342,7 +342,7 @@ class UrdfTree:
             child = self.ends[name][1]
             if self.elements[name].get("type") in ("planar", "floating"):
                 return child
-            if moves_in_a_plane([self._joint(above) for above in joints[:k]]):
+            if moves_in_a_plane([self._joint(joint) for joint in joints[:k]]):
                 return child
             bare += [self.links[child].find(kind) is None for kind in ("collision", "visual")]
         return self.root
@@ -354,7 +354,7 @@ class UrdfTree:
         if kind not in KINDS:
             raise InputError(
                 f"{self.path}: {location} has type {shown(kind)}; supported: {', '.join(KINDS)}; remove it "
-                f"with what it carries, or use --base {self.ends[name][1]} to plan for what it carries alone"
+                f"with what it carries, or use --base {self.ends[name][1]} to plan only for what it carries"
             )
         axis_element = element.find("axis")
         axis = np.array([1.0, 0.0, 0.0])
@@ -437,8 +437,8 @@ class UrdfTree:
         return _changed(joint, {"velocity": velocity})
 
     def inertias(self, links: list[str]) -> dict[str, Inertia]:
-        """Inertias of the links that have a mass. Physically impossible inertias are left out, with a
-        note."""
+        """Inertias of the links that have a mass. Incomplete and physically impossible inertias are left out,
+        with a note."""
         inertias = {}
         for link in links:
             element = self.links[link].find("inertial")
@@ -454,7 +454,7 @@ class UrdfTree:
                 own = inertia_of([value, *T[:3, 3], *entries])
                 inertias[link] = own._replace(moments=T[:3, :3] @ own.moments @ T[:3, :3].T)
             except (InputError, ValueError):
-                self.notes.append(f"link {link} has a physically impossible inertia; left out")
+                self.notes.append(f"link {link} has an incomplete or physically impossible inertia; left out")
         return inertias
 
     def geometry(self, links: list[str]) -> dict[str, tuple[ConvexMesh, ...]]:
@@ -552,7 +552,8 @@ class UrdfTree:
         return Surface(vertices, faces)
 
     def _numbers(self, text: str, count: int, what: str, most: float = MAX_COORDINATE) -> Values:
-        """The `count` numbers of an attribute. Raises InputError if their absolute values exceed `most`."""
+        """The `count` numbers of an attribute. Raises InputError for another number of values, and for values
+        that are not finite or not within ±`most`."""
         try:
             values = np.array([float(word) for word in text.split()])
         except ValueError:
@@ -604,7 +605,8 @@ def read_limits(file: str | Path) -> tuple[dict[str, dict[str, float]], tuple[st
     The file has the form joint_limits: {JOINT: {max_velocity: 2.0}}, with the fields min_position,
     max_position, max_velocity, max_acceleration and max_jerk. A field is ignored if MoveIt's flag for it,
     such as has_velocity_limits, is false. Other entries beside joint_limits, such as MoveIt's default scaling
-    factors, are ignored, with a note. Raises InputError that names the joint and the field.
+    factors, are ignored, with a note. Raises InputError for a file without joint_limits, and for unknown
+    fields and wrong values.
     """
     data = read_yaml(file, "joint limits")
     joints = data.get("joint_limits") if isinstance(data, dict) else None
@@ -626,11 +628,12 @@ def read_limits(file: str | Path) -> tuple[dict[str, dict[str, float]], tuple[st
 
 
 def with_limits(robot: Robot, limits: dict[str, dict[str, float]]) -> Robot:
-    """The robot with changed limits, given by joint and field. Raises InputError for an unknown joint.
+    """The robot with changed limits, given by joint and field. Raises InputError for an unknown joint, and
+    for a lower limit above the upper one.
 
-    A new velocity limit also sets the acceleration and jerk limits in the default ratios, unless these are
-    given. A continuous joint with a position limit becomes revolute; if only one of its limits is given, the
-    other one is half a turn from zero.
+    A new velocity limit also sets the acceleration limit, and a new acceleration limit the jerk limit, in the
+    default ratios, unless these limits are given too. A continuous joint with a position limit becomes
+    revolute; if only one of its limits is given, the other one is half a turn from zero.
     """
     movable = {joint.name: joint for joint in robot.joints if joint.kind in MOVING_KINDS}
     for name in limits:
