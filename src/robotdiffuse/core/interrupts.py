@@ -56,7 +56,7 @@ def exit_fast(run: Callable[[], int]) -> NoReturn:
     """Call `run` and exit with the status that it returns. Exit handlers run, but the interpreter is not torn
     down, which would take 5 % of the time of a `plan` command.
 
-    Under torchrun, exit handlers are skipped too: threads of PyTorch's process group, which call Python
+    Under torchrun, exit handlers are skipped as well: threads of PyTorch's process group, which call Python
     during the exit, would sometimes abort the process under load. All files are written by then.
     """
     status = 1

@@ -51,7 +51,8 @@ ROWS_PER_SHARD = 500
 FAMILY = "own"
 """Family name of all scenes of a data set written by `write_dataset`."""
 RESOLUTION = 0.02
-"""No point of the arm moves further than this between two checks of the straight line [m]."""
+"""No point of the arm moves further than this between two checks of the straight line from start to goal
+[m]."""
 WAYPOINTS = 254
 DOF = 7
 CONDITION_NUMBERS = 23
@@ -90,9 +91,9 @@ def write_dataset(
         The number of motions.
 
     Raises:
-        InputError: If there are no paths, if a list of scenes does not have one for each path, and if no scene
-            falls into the training split; for joint values of the wrong shape or out of limits, obstacles that
-            are no spheres or boxes, fewer than 2 waypoints, and a folder that holds data.
+        InputError: If there are no paths, if a list of scenes does not have one for each path, and if no
+            scene falls into the training split; for joint values of the wrong shape or out of limits,
+            obstacles that are no spheres or boxes, fewer than 2 waypoints, and a folder that holds data.
 
     Examples:
         >>> start, goal = [0, -0.8, 0, -2.4, 0, 1.6, 0.8], [0.5, -0.2, 0, -2, 0, 1.8, 0.8]

@@ -82,7 +82,7 @@ class Bench:
 
     folder: FilePath
     sessions: tuple[dict[str, Any], ...]
-    """One entry for each call of `bench run`: machine, versions, settings."""
+    """One entry for each time that `bench run` was started: machine, versions, settings."""
     records: dict[str, list[Record]]
     """Records by planner, in the order of PLANNERS. A planner with restarts follows the same planner without
     restarts."""
@@ -363,8 +363,8 @@ class Section:
 
 
 def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Section]:
-    """The results on all problem sets. Sets of random problems get a second section, with only the
-    non-trivial problems that at least one planner solves.
+    """The results on all problem sets. Sets of random problems, some of them trivial, get a second section
+    with only the non-trivial problems that at least one planner solves.
 
     `limits` are the time limits to report [s]; None: the limits of the records, and all LIMITS below the
     longest of them. Raises InputError if no planner has results for any of the limits, or those that have

@@ -112,8 +112,8 @@ def _max_offset(points, low, voxel):
     for p in range(len(points)):
         square = _ZERO
         for axis in range(3):
-            at = (points[p, axis] - low[axis]) / voxel
-            off = at - np.floor(at) - _HALF
+            coordinate = (points[p, axis] - low[axis]) / voxel
+            off = coordinate - np.floor(coordinate) - _HALF
             square += off * off
         max_square = max(max_square, square)
     return voxel * np.sqrt(max_square) + _SLACK
@@ -215,8 +215,8 @@ def _ask_grid(centers, radius, scene):
 
 @allocation_free()
 def far_from_points(scene, low, high, radius):
-    """Whether no sphere with its center in the box from `low` to `high` can touch a point, according to one
-    look-up in the middle of the box."""
+    """Whether one look-up, in the middle of the box from `low` to `high`, shows that no sphere of this radius
+    with its center in the box touches a point."""
     lower = points_lower_bound(scene, times(_HALF, plus(low, high)))
     return lower > radius + _HALF * length(minus(high, low)) + _SLACK
 

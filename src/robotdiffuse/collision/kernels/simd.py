@@ -31,7 +31,8 @@ _FLOAT = ir.FloatType()
 _BITS = ir.IntType(64)
 _VECTOR = ir.VectorType(_FLOAT, W)
 _INTEGERS = ir.VectorType(ir.IntType(32), W)
-_EVERYWHERE = ir.Constant(_INTEGERS, [0] * W)
+# Indices of a shuffle that copies element 0 to all lanes
+_FIRST_TO_ALL = ir.Constant(_INTEGERS, [0] * W)
 # Alignment that loads, stores and gathers rely on [bytes]: that of one float32
 _ALIGN = 4
 # typed Any because callers do not pass the first argument, the context
@@ -56,7 +57,7 @@ class _LanesModel(PrimitiveModel):
 
 def _splat(builder: Any, scalar: Any) -> Any:
     single = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), scalar, ir.Constant(_BITS, 0))
-    return builder.shuffle_vector(single, ir.Constant(_VECTOR, ir.Undefined), _EVERYWHERE)
+    return builder.shuffle_vector(single, ir.Constant(_VECTOR, ir.Undefined), _FIRST_TO_ALL)
 
 
 @lower_cast(types.float32, LanesType)
@@ -234,7 +235,7 @@ def lanes_with_bit(_context: Any, a: Any, bit: Any) -> Any:
     def codegen(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
         numbers = builder.fptosi(args[0], _INTEGERS)
         single = builder.insert_element(ir.Constant(_INTEGERS, ir.Undefined), args[1], ir.Constant(_BITS, 0))
-        bits = builder.shuffle_vector(single, ir.Constant(_INTEGERS, ir.Undefined), _EVERYWHERE)
+        bits = builder.shuffle_vector(single, ir.Constant(_INTEGERS, ir.Undefined), _FIRST_TO_ALL)
         common = builder.and_(numbers, bits)
         return _mask(builder, builder.icmp_unsigned("!=", common, ir.Constant(_INTEGERS, [0] * W)))
 
