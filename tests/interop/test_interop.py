@@ -255,7 +255,7 @@ def test_bad_motions_are_refused_in_one_line() -> None:
     finger = [*NAMES, FINGERS[0]]
     told = "has panda_finger_joint1 at 0.01, the problem locks it at 0.04: write `locked: {panda_finger_joint1"
     refuses(told, of_panda, finger, [[*START, 0.01]])
-    told = "moves panda_finger_joint1 from 0 to 0.04, which the problem locks at 0.04"
+    told = "moves panda_finger_joint1 between 0 and 0.04; the problem locks it at 0.04"
     refuses(told, of_panda, finger, [[*START, 0.04], [*START, 0.0]])
 
 
@@ -304,7 +304,7 @@ def test_damaged_files_are_refused_in_one_line(planned: Planned, tmp_path: Path)
         ("time,a\n0,1,2\n", "line 2 has 3 cells; the header has 2"),
         ("time,a\n0,x\n", "line 2: a is 'x'; it must be a number"),
         ("\ntime,a\n\n0,1\n\n1,x\n", "line 6: a is 'x'"),
-        ("time,a,a_position\n0,1,1\n", "the header has 'a_position' more than once"),
+        ("time,a,a_position\n0,1,1\n", "the header has positions of 'a' more than once"),
         ("time,a,b_velocity\n0,1,1\n", "velocities of other joints"),
         ("time,a\n0,nan\n", "must be finite"),
     ],

@@ -54,7 +54,7 @@ def check_export(file: str | Path, *inputs: str) -> Path:
     written.
 
     Raises InputError for an ending that is not in WRITERS or TRAJECTORY_ENDINGS, for a package that is not
-    installed, for a folder that is missing or read-only, and for one of the files `inputs`.
+    installed, for a folder that is missing or read-only, and if the file is one of `inputs`.
     """
     path = file_name(file)
     ending = path.suffix.lower()
@@ -81,8 +81,8 @@ def write_motion(problem: "Problem", trajectory: "Trajectory", file: str | Path)
 def read_motion(file: str | Path, topic: str | None = None) -> "RecordedMotion":
     """Read a motion from a file of any program; a folder is read as a ROS 2 bag.
 
-    Raises InputError for another ending, a file that is damaged or holds no motion, and a package that is not
-    installed.
+    Raises InputError for an ending that is not in READERS, a file that is damaged or holds no motion, and a
+    package that is not installed.
     """
     path = file_name(file)
     ending = BAG if path.is_dir() else path.suffix.lower()

@@ -58,7 +58,8 @@ class StampedView(NamedTuple):
 
 
 def write_depth_views(robot: Robot, views: Mapping[str, Sequence[StampedView]], file: str | Path) -> None:
-    """Write views as .mcap. views: the views of each camera, by its name; each must have a configuration.
+    """Write views as .mcap. views: the views of each camera, by its name; each view must have a
+    configuration.
 
     Joint states and transforms are written only at the stamps of the images.
     """
@@ -149,8 +150,9 @@ def read_depth_views(
         An iterator over the views, each with the stamp of its image [s].
 
     Raises:
-        InputError: For a file that is damaged or holds no depth images, if no image has joint states and
-            transforms within 0.1 s, and for distorted or compressed images.
+        InputError: For a file that is damaged or holds no uncompressed depth images, for a topic without
+            images or with another encoding, if no image has joint states and transforms within 0.1 s, for an
+            image without CameraInfo of its size, and for distorted images.
 
     Examples:
         >>> for stamp, view in rd.read_depth_views("recording.mcap", rd.load_robot("panda")):
@@ -183,12 +185,12 @@ def _read(
     infos: dict[str, dict[str, Any]] = {}
     units: dict[str, float] = {}
     has_states = JOINT_STATE in kinds.values()
-    # the meters per unit of a sensor's depth images, as librealsense writes them
+    # topics with the meters per unit of a sensor's depth images, in bags of librealsense
     unit_topics = [name for name in kinds if name.replace(" ", "_").endswith("/option/Depth_Units/value")]
     other_topics = [name for name, kind in kinds.items() if kind in (JOINT_STATE, TRANSFORMS, CAMERA_INFO)]
     for topic, at, message in recording.messages(other_topics + unit_topics):
         kind = kinds[topic]
-        if kind == CAMERA_INFO:  # the names are upper-case in ROS 1: K, D, P
+        if kind == CAMERA_INFO:  # fields are upper-case in ROS 1: K, D, P
             infos.setdefault(_folder(topic), {k.lower(): value for k, value in to_plain(message).items()})
         elif kind == JOINT_STATE:
             states.add(_seconds(message, at), to_plain(message))
@@ -214,7 +216,7 @@ def _read(
             continue
         has_views = True
         intrinsics = _intrinsics(topic, infos.get(_folder(topic)), message)
-        unit = next((unit for device, unit in units.items() if topic.startswith(f"{device}/")), None)
+        unit = next((unit for sensor, unit in units.items() if topic.startswith(f"{sensor}/")), None)
         yield StampedView(stamp, DepthView(_depth(location, message, unit), intrinsics, T, q))
     if not has_views:
         listed = ", ".join(f"{topic} ({kind})" for topic, kind in kinds.items()) or "none"
@@ -303,7 +305,9 @@ class TransformHistory:
         quaternion = np.array([turn[axis] for axis in "wxyz"])
         length = np.linalg.norm(quaternion)
         if not length > 0:
-            raise InputError(f"the transform of {child} has the rotation {quaternion.tolist()}")
+            raise InputError(
+                f"the transform of {child} has the rotation {quaternion.tolist()}, which cannot be normalized"
+            )
         rotation = rotation_from_quaternion(quaternion / length)
         T = transform(np.array([place[axis] for axis in "xyz"]), rotation)
         self._parent[child] = message["header"]["frame_id"].lstrip("/")
@@ -319,17 +323,17 @@ class TransformHistory:
         transform of the chain is not near in time.
         """
         T = np.eye(4)
-        at = frame.lstrip("/")
-        passed = [at]  # `frame` and its ancestors up to `at`
-        while at != base.lstrip("/"):
-            if at not in self._parent or len(passed) > len(self._parent) + 1:  # no parent, or a cycle
+        current = frame.lstrip("/")
+        passed = [current]  # `frame` and its ancestors up to `current`
+        while current != base.lstrip("/"):
+            if current not in self._parent or len(passed) > len(self._parent) + 1:  # no parent, or a cycle
                 raise InputError(
-                    f"no transforms connect {frame}, the frame of {where}, with {base}; the parents of "
+                    f"no transforms connect {frame}, the frame of {where}, with {base}; the ancestors of "
                     f"{frame} are {', '.join(passed[1:]) or 'none'}"
                 )
-            T = self._pose_in_parent(at, stamp, where) @ T
-            at = self._parent[at]
-            passed.append(at)
+            T = self._pose_in_parent(current, stamp, where) @ T
+            current = self._parent[current]
+            passed.append(current)
         return T
 
     def _pose_in_parent(self, frame: str, stamp: float, where: str) -> Pose:

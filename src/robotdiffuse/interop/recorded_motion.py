@@ -65,9 +65,9 @@ def checked_motion(
 ) -> RecordedMotion:
     """The motion with these parts, after checking them.
 
-    Empty times, velocities and accelerations count as absent. Times are shifted to begin at 0; times that are
-    all 0 count as absent. Raises InputError as `check_motion_arrays` does, and for times that do not
-    increase.
+    Empty times, velocities and accelerations count as absent, and so do the times of several rows that are
+    all 0. Without times, velocities and accelerations are left out. Times are shifted to begin at 0. Raises
+    InputError as `check_motion_arrays` does, and for times that do not increase.
     """
     optional_fields = {"times": times, "velocities": velocities, "accelerations": accelerations}
     arrays = {name: value for name, value in optional_fields.items() if not _empty(value)}
@@ -153,8 +153,8 @@ def _check_locked(values: Values, name: str, robot: Robot) -> None:
     high = float(values.max())
     if high - low > STATIONARY_TOLERANCE + LOCKED_TOLERANCE:
         raise InputError(
-            f"the motion moves {name} from {low:.6g} to {high:.6g}, "
-            f"which the problem locks at {locked_value:.6g}"
+            f"the motion moves {name} between {low:.6g} and {high:.6g}; "
+            f"the problem locks it at {locked_value:.6g}"
         )
     if max(abs(low - locked_value), abs(high - locked_value)) > LOCKED_TOLERANCE:
         raise InputError(
@@ -196,8 +196,8 @@ def problem_of_motion(motion: RecordedMotion, robot: Robot, scene: Scene) -> Pro
 
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 MATCH_TIME = 0.5
-"""Waiting time before the message is sent, so that subscribers match the publisher, and after it, so that
-they receive it [s]."""
+"""Waiting time before the message is sent, so that subscribers match the publisher, and after it was sent, so
+that they receive the message [s]."""
 TIMES = ("time", "t", "time_from_start", "timestamp")
 """Names that the column of times may have."""
 KINDS = {"position": "positions", "velocity": "velocities", "acceleration": "accelerations"}
@@ -232,7 +232,7 @@ def read_csv(file: FilePath, topic: str | None = None) -> RecordedMotion:
 
 
 def motion_from_record(record: Any, where: str) -> RecordedMotion:
-    """The motion in a record. Raises InputError, naming `where`, if there is none."""
+    """The motion in a record. Raises InputError, naming `where`, for a record without a valid motion."""
     with reading(where):
         return _motion(record)
 
@@ -281,15 +281,15 @@ def _joint_trajectory(record: Mapping[str, Any]) -> RecordedMotion:
     for i, point in enumerate(points):
         if not isinstance(point, Mapping):
             raise InputError(f"points[{i}] is {shown(point)}; it must be a JointTrajectoryPoint")
-        for name, column in rows.items():
-            column.append(_list(point.get(name)))
+        for name, values in rows.items():
+            values.append(_list(point.get(name)))
     times = [
         _seconds(f"points[{i}].time_from_start", p.get("time_from_start", 0)) for i, p in enumerate(points)
     ]
     for name in ("velocities", "accelerations"):
         has_values = [len(row) > 0 for row in rows[name]]
         if any(has_values) and not all(has_values):
-            raise InputError(f"points[{has_values.index(False)}] has no {name}, but others do")
+            raise InputError(f"points[{has_values.index(False)}] has no {name}; other points have them")
     return checked_motion(
         _list(record.get("joint_names")), rows["positions"], times, rows["velocities"], rows["accelerations"]
     )
@@ -365,7 +365,7 @@ def _table(text: str) -> RecordedMotion:
         quantity = KINDS.get(kind, "positions")
         joint = joint if kind in KINDS else name
         if joint in columns_of[quantity]:
-            raise InputError(f"the header has {shown(name)} more than once")
+            raise InputError(f"the header has {quantity} of {shown(joint)} more than once")
         columns_of[quantity][joint] = column
     names = list(columns_of["positions"])
     for quantity in ("velocities", "accelerations"):

@@ -47,16 +47,16 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
 def _log_motion(recording: rr.RecordingStream, problem: Problem, trajectory: Trajectory) -> None:
     robot = problem.robot
     times = trajectory.times
-    frames = max(int(np.ceil(times[-1] * FPS)), 1) + 1
-    frame_rows = np.unique(np.searchsorted(times, np.linspace(0, times[-1], frames)).clip(0, len(times) - 1))
-    frame_times = rr.TimeColumn(TIMELINE, duration=times[frame_rows])
+    count = max(int(np.ceil(times[-1] * FPS)), 1) + 1
+    drawn_rows = np.unique(np.searchsorted(times, np.linspace(0, times[-1], count)).clip(0, len(times) - 1))
+    drawn_times = rr.TimeColumn(TIMELINE, duration=times[drawn_rows])
     for link in robot.link_names:
         _send_poses(
-            recording, f"robot/{link}", frame_times, link_poses(robot, trajectory.positions[frame_rows], link)
+            recording, f"robot/{link}", drawn_times, link_poses(robot, trajectory.positions[drawn_rows], link)
         )
     for moving in problem.moving:
         _send_poses(
-            recording, _entity(moving.name), frame_times, [moving.pose(t) for t in times[frame_rows].tolist()]
+            recording, _entity(moving.name), drawn_times, [moving.pose(t) for t in times[drawn_rows].tolist()]
         )
     row_times = rr.TimeColumn(TIMELINE, duration=times)
     for j, name in enumerate(trajectory.joint_names):

@@ -45,7 +45,7 @@ def fingerprint(module: nn.Module) -> str:
 
 
 def save_network(name: str, network: Any, folder: str | FilePath, training: dict[str, Any]) -> None:
-    """Write NAME.safetensors and NAME.json; `name` as in NETWORKS, or encoder.
+    """Write NAME.safetensors, NAME.json and the ONNX files; `name` as in NETWORKS, or "encoder".
 
     training: information for people, such as the data's fingerprint and the number of samples.
     """
@@ -84,11 +84,11 @@ def _load(name: str, folder: FilePath) -> Any:
     table, entry = (ENCODERS, about.get("network", "")) if name == "encoder" else (NETWORKS, name)
     kind = table.load(entry)
     settings: Any = table.settings(entry)
-    parts = [settings.from_json(about.get("settings"), f"{location}: settings")]
+    arguments = [settings.from_json(about.get("settings"), f"{location}: settings")]
     if issubclass(kind, Network):
-        parts.insert(0, identity(name, folder))
+        arguments.insert(0, identity(name, folder))
     try:
-        network = kind(*parts)
+        network = kind(*arguments)
     except (RuntimeError, TypeError, MemoryError, OverflowError) as error:
         # PyTorch's errors for impossible sizes
         raise InputError(
@@ -115,7 +115,7 @@ def load_completion(folder: str | FilePath | None = None) -> CompletionNetwork:
 
 
 def load_network(name: str, folder: str | FilePath | None, robot: Robot) -> Any:
-    """The trained network of a folder, ready to use; None: with the weights that `weights_for` finds.
+    """The trained network of the folder that `weights_folder` finds, ready to use.
 
     Raises InputError if there is no network, naming the command that trains it, and for files that are
     damaged or made for another robot.

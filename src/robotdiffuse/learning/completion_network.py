@@ -1,10 +1,10 @@
 """The occupancy completion network: from an observed volume to the probability that each voxel of 2 cm is
 occupied.
 
-A U-Net of residual blocks. The input's voxels of 4 cm are folded into blocks of 2 x 2 x 2, to avoid computing
-at their full resolution: the finest cells have 8 cm, and each predicts its 4 x 4 x 4 voxels of 2 cm. There is
-no normalization, because a layer that needs single precision would make training in bf16 several times
-slower. Features are the last axis in memory, which is the fast layout for bf16.
+A U-Net of residual blocks. The input's voxels of 4 cm are folded into cells of 2 x 2 x 2, to avoid computing
+at the resolution of the voxels: the finest cells have 8 cm, and each predicts its 4 x 4 x 4 voxels of 2 cm.
+There is no normalization, because a layer that needs single precision would make training in bf16 several
+times slower. Features are the last axis in memory, which is the fast layout for bf16.
 """
 
 import numpy as np
@@ -28,7 +28,7 @@ CHANNELS = 7
 """Number of input channels: occupied, free, shadow of the arm, out of view, depth behind a surface, height,
 distance from the base's axis."""
 DEPTH_SCALE = DEPTH_STEP / 0.5
-"""Depths behind surfaces are stored as numbers of DEPTH_STEP; multiplied by this, half a meter becomes 1."""
+"""Depths behind surfaces are stored as multiples of DEPTH_STEP; times this, half a meter becomes 1."""
 
 
 def _position_inputs() -> Float[Tensor, "28 28 16 16"]:
@@ -39,18 +39,18 @@ def _position_inputs() -> Float[Tensor, "28 28 16 16"]:
 
 
 def folded(x: Shaped[Tensor, "n i j k"]) -> Shaped[Tensor, "n i//2 j//2 k//2 8"]:
-    """Voxels grouped into blocks of 2 x 2 x 2; the last axis is the index in the block, 4 x + 2 y + z."""
+    """Voxels grouped into cells of 2 x 2 x 2; the last axis is the index in the cell, 4 x + 2 y + z."""
     n, i, j, k = x.shape
-    blocks = x.reshape(n, i // 2, 2, j // 2, 2, k // 2, 2).permute(0, 1, 3, 5, 2, 4, 6)
-    return blocks.reshape(n, i // 2, j // 2, k // 2, 8)
+    cells = x.reshape(n, i // 2, 2, j // 2, 2, k // 2, 2).permute(0, 1, 3, 5, 2, 4, 6)
+    return cells.reshape(n, i // 2, j // 2, k // 2, 8)
 
 
 def unfolded(x: Shaped[Tensor, "n i j k c"]) -> Shaped[Tensor, "n 2*i 2*j 2*k c//8"]:
     """The inverse of `folded`: a pixel shuffle in three dimensions. The features are read as [8, c // 8]:
-    the index in the block, and the features of each voxel."""
+    the index in the cell, and the features of each voxel."""
     n, i, j, k, c = x.shape
-    blocks = x.reshape(n, i, j, k, 2, 2, 2, c // 8).permute(0, 1, 4, 2, 5, 3, 6, 7)
-    return blocks.reshape(n, 2 * i, 2 * j, 2 * k, c // 8)
+    voxels = x.reshape(n, i, j, k, 2, 2, 2, c // 8).permute(0, 1, 4, 2, 5, 3, 6, 7)
+    return voxels.reshape(n, 2 * i, 2 * j, 2 * k, c // 8)
 
 
 def _shuffled(x: Float[Tensor, "n c i j k"]) -> Float[Tensor, "n c//8 2*i 2*j 2*k"]:

@@ -121,9 +121,9 @@ class Objective:
     """What the network is trained to predict: the clean trajectory x_0 itself (paper, Method).
 
     Each objective is a linear function of the clean trajectory and the noise. So the clean trajectory can be
-    computed from each of these outputs, and samplers work on clean trajectories only. The formulas are plain
-    arithmetic for NumPy arrays and PyTorch tensors alike; `signal` and `noise_level` are the schedule's
-    values at the levels of the trajectories, and broadcast against these.
+    computed from x_t and the output for it, and samplers work on clean trajectories only. The formulas are
+    plain arithmetic for NumPy arrays and PyTorch tensors alike; `signal` and `noise_level` are the schedule's
+    values at the levels of the trajectories, and broadcast against the trajectories.
     """
 
     def target(self, clean: Array, noise: Array, signal: Any, noise_level: Any) -> Array:
@@ -244,10 +244,10 @@ def _step(
     """Mean and standard deviation of x at the level `lower`, from x at `level` and its clean prediction."""
     signal, signal_low = schedule.signal[[level, lower]].tolist()
     noise, noise_low = schedule.noise[[level, lower]].tolist()
-    added = max(noise**2 - (signal / signal_low * noise_low) ** 2, 0.0) ** 0.5
-    added_noise = eta * noise_low / noise * added
+    forward_noise = max(noise**2 - (signal / signal_low * noise_low) ** 2, 0.0) ** 0.5
+    fresh_noise = eta * noise_low / noise * forward_noise
     predicted_noise = (x - signal * clean) / noise
-    return signal_low * clean + (noise_low**2 - added_noise**2) ** 0.5 * predicted_noise, added_noise
+    return signal_low * clean + (noise_low**2 - fresh_noise**2) ** 0.5 * predicted_noise, fresh_noise
 
 
 SAMPLERS = Registry(

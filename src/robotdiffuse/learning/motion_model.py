@@ -48,10 +48,11 @@ TARGETS = ("residual", "absolute", "limits")
 
 
 class Reference(NamedTuple):
-    """The trajectory that x is relative to, and the fixed first and last waypoint of x."""
+    """The trajectory that the diffused variable x (see `MotionModel`) is relative to, and the fixed first and
+    last waypoint of x."""
 
     base: Trajectories
-    """Normalized joint values; the trajectory is `base + scale * x`."""
+    """Normalized joint values; x stands for the trajectory `base + residual_scale * x`."""
     start: Float[ndarray, "*batch 1 dof"]
     """The first waypoint of x."""
     goal: Float[ndarray, "*batch 1 dof"]
@@ -86,7 +87,7 @@ class SamplingSettings(Settings, name="sampling"):
     eta: Share = 0.0
     """Amount of new noise in each denoising step: 0 is DDIM, 1 is ancestral sampling."""
     guided_share: Share = 0.5
-    """Share of the denoising steps, at their end, that are guided: 0 none, 1 all (the paper's)."""
+    """Share of the denoising steps that are guided; these are the last ones: 0 none, 1 all (the paper's)."""
     guidance_scale: float = 1.0
     """Scale of classifier-free guidance: 1 uses the network's prediction as it is, larger values strengthen
     the condition, 0 ignores it. Values other than 1 need weights that were trained with a condition_drop
@@ -319,16 +320,16 @@ class MotionModel(ABC):
     def features(
         self, x: Float[ndarray, "batch waypoints dof"], reference: Reference, clearances: ClearanceFn
     ) -> Features:
-        """The denoiser's input for a noisy x: x; the normalized joint values, unless x itself is these; and,
+        """The denoiser's input for a noisy x: x; the normalized joint values, unless they are x itself; and,
         if the settings include them, the clearances of the links and their gradients."""
         unit = self.unit_joints(x, reference)
         parts = [x] if self.is_unit_joints else [x, unit]
         if not self.settings.clearance_features:
             return np.concatenate(parts, axis=-1)
         inputs = clearances(self.normalizer.from_unit(unit))
-        near = np.clip(inputs[..., : len(self.robot.links)], MIN_CLEARANCE, MAX_CLEARANCE)
-        near = (near - (MIN_CLEARANCE + MAX_CLEARANCE) / 2) * (2 / (MAX_CLEARANCE - MIN_CLEARANCE))
-        parts.append(near.astype(np.float32, copy=False))
+        scaled = np.clip(inputs[..., : len(self.robot.links)], MIN_CLEARANCE, MAX_CLEARANCE)
+        scaled = (scaled - (MIN_CLEARANCE + MAX_CLEARANCE) / 2) * (2 / (MAX_CLEARANCE - MIN_CLEARANCE))
+        parts.append(scaled.astype(np.float32, copy=False))
         if self.settings.clearance_gradients:
             parts.append(np.clip(inputs[..., -self.dof :] / np.float32(GRADIENT_UNIT), -1, 1))
         return np.concatenate(parts, axis=-1)
@@ -339,8 +340,8 @@ class MotionModel(ABC):
         start: Joints,
         goal: Joints,
     ) -> Float[ndarray, "*batch condition"]:
-        """C = [z, start, goal], normalized. Without an encoder, C is a single zero, because the condition of
-        a denoiser must not be empty."""
+        """C = [z, start, goal]; start and goal are normalized. Without an encoder, C is a single zero, because
+        the condition of a denoiser must not be empty."""
         if self.settings.encoder is None:
             return np.zeros((*np.shape(start)[:-1], 1), np.float32)
         ends = [self._unit(q) for q in (start, goal)]
@@ -401,12 +402,12 @@ class MotionModel(ABC):
         predict_unguided = self.predictor(
             reference, self.condition(embedding, start, goal), clearances, scale
         )
-        unguided = steps - ceil(settings.guided_share * steps - 1e-9)
-        guided: Int[ndarray, "n"] = self.schedule.sampling_levels(steps)[unguided:-1]
+        unguided_steps = steps - ceil(settings.guided_share * steps - 1e-9)
+        guided_levels: Int[ndarray, "n"] = self.schedule.sampling_levels(steps)[unguided_steps:-1]
 
         def predict(x: ndarray, level: int) -> ndarray:
             clean = predict_unguided(x, level)
-            if guide is not None and level in guided:
+            if guide is not None and level in guided_levels:
                 improved = guide(self.joints(clean, reference), level / self.schedule.steps)
                 clean = self.normalize(improved, reference)
             return clean
@@ -445,7 +446,7 @@ class MotionModel(ABC):
 
 
 PackedClearanceFn = Callable[[PackedScenes, ndarray], ndarray]
-"""A `ClearanceFn` that also takes scenes, one for each of its n trajectories."""
+"""A `ClearanceFn` that also takes scenes, one for each trajectory."""
 
 
 def link_clearances(checker: CollisionChecker, settings: MotionModelSettings) -> ClearanceFn:
@@ -470,8 +471,8 @@ def _carriers(checker: CollisionChecker) -> tuple[int, list[int]]:
     """The number of the checker's links that belong to the bare arm, and the carrier of each attached body.
     Attached bodies follow the arm's links in `checker.links`.
 
-    The carrier is the index of the arm's link to which the body is fixed. If that link has no clearance, it
-    is the index of the last link whose frame does not come after the body's frame in the kinematic tree.
+    The carrier is the index of the arm's link to which the body is fixed. If that link has no clearance, the
+    carrier is the last of the arm's links whose frame number is at most that of the body's frame.
     """
     robot = checker.robot
     arm = [link for link in checker.links if link in robot.arm.link_names]

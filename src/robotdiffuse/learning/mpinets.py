@@ -6,8 +6,8 @@ decoded to a displacement, q_{t+1} = clamp(q_t + dq). Trained by behavior clonin
 motions, with the paper's two losses: the mean L1 and squared distances between points of the arm at the
 predicted and at the expert's next configuration, and a hinge on the signed distance to the scene.
 
-Settings as in the paper: displacements in units of the joint ranges, clamped at the limits; weights 1 and 5
-of point match and collision; hinge at 3 cm; noise of 0.015 rad on the input; LeakyReLU in encoder and
+Settings as in the paper: configurations scaled by the joint ranges, and clamped at the limits; weights 1 and
+5 of point match and collision; hinge at 3 cm; noise of 0.015 rad on the input; LeakyReLU in encoder and
 decoder, group normalization in the layers after PointNet++ and none within it; layers 32, 64, 128, 128, 64
 for the configuration and 512, 256, 128 for the decoder.
 
@@ -26,9 +26,9 @@ Differences from the paper:
 - The collision loss is on the arm's covering spheres, which protrude a little, not on points.
 - The expert's motions come from our data and have 48 waypoints (paper: 50), forwards or backwards, with one
   step at rest at the end.
-- Displacements are output in units of the experts' root mean square step, and weights are initialized as in
-  K. He et al. (ICCV 2015): with PyTorch's defaults, activations fade over the many layers, and training takes
-  many times as long.
+- The decoder outputs displacements in units of the experts' root mean square step, and weights are
+  initialized as in K. He et al. (ICCV 2015): with PyTorch's defaults, activations fade over the many layers,
+  and training takes many times as long.
 """
 
 from dataclasses import dataclass, field
@@ -59,8 +59,8 @@ Configurations = Float32[Tensor, "n dof"]
 Clouds = Float32[Tensor, "n points 3"]
 Joints = Float32[ndarray, "n dof"]
 DIRECTION_OFFSET = 0.1
-"""The vector to the goal is divided by its length plus this [half joint ranges] to give the direction, so
-that the direction fades near the goal."""
+"""The direction to the goal is twice the vector to the goal, divided by the vector's length plus this [half
+joint ranges], so that the direction fades near the goal."""
 LOSS_UNIT = 0.01
 """Losses are divided by this [m], so that they are near 1."""
 RADII = (0.2, 0.6)
@@ -225,14 +225,14 @@ class MPiNetsNetwork(BaselineNetwork):
         # the same points every time, so that a checkpoint need not store them
         self._surface = SurfacePoints(kinematics, s.robot_points, np.random.default_rng(0))
         self._distance = ArmDistance(kinematics)
-        on_arm = self._surface(torch.zeros(self.dof)).shape[0]
-        links = on_arm // s.robot_points
-        self._target = torch.arange(on_arm).view(links, -1)[:, : s.target_points].flatten()
-        link = 1 + torch.arange(links)
+        arm_points = self._surface(torch.zeros(self.dof)).shape[0]
+        links = arm_points // s.robot_points
+        self._target = torch.arange(arm_points).view(links, -1)[:, : s.target_points].flatten()
+        link_labels = 1 + torch.arange(links)
         scene = torch.zeros(s.scene_points, dtype=torch.int64)
-        on_robot = link.repeat_interleave(s.robot_points)
-        label = torch.cat([scene, on_robot, links + link.repeat_interleave(s.target_points)])
-        self._labels = nn.functional.one_hot(label, 1 + 2 * links).float()
+        arm = link_labels.repeat_interleave(s.robot_points)
+        target = links + link_labels.repeat_interleave(s.target_points)
+        self._labels = nn.functional.one_hot(torch.cat([scene, arm, target]), 1 + 2 * links).float()
         """One-hot labels: scene, each link of the robot, each link of the target."""
         self.first = SetAbstraction(1 + 2 * links, s.first_widths, s.centers[0], s.neighbors[0], RADII[0])
         self.second = SetAbstraction(
@@ -276,8 +276,8 @@ class MPiNetsNetwork(BaselineNetwork):
         """The next configurations, within limits [rad]; clouds of the scenes [m], q and goal in [rad]."""
         points = torch.cat([clouds, self._surface(q), self._surface(goal)[:, self._target]], 1).detach()
         with fast_autocast():
-            layer = self.first(points, self._labels.expand(len(q), -1, -1))
-            together = self.together["layers"](torch.cat(self.second(*layer), -1))
+            groups = self.first(points, self._labels.expand(len(q), -1, -1))
+            together = self.together["layers"](torch.cat(self.second(*groups), -1))
             cloud_code = self.cloud_code(together)
         # in fp32, since bf16 would round configurations to a hundredth of a radian
         x = self.to_unit(q)

@@ -23,7 +23,8 @@ from robotdiffuse.learning.encoders.networks import OCTAVES, perceptron, wave_an
 
 MAX_UNFUSED_TOKENS = 96
 """On a CPU, attention in fp32 uses PyTorch's fused kernel only for more tokens than this; in bf16 it never
-uses the fused kernel.
+uses the fused kernel. The limit is a compromise: at 66 tokens the
+fused kernel was faster, at 97 it was not.
 
 Times of a forward and a backward pass [ms], torch 2.13, one thread:
 
@@ -117,7 +118,8 @@ class Denoiser(nn.Module, ABC):
     """A network from a noisy trajectory to the output that the model's objective defines."""
 
     out: nn.Linear
-    """The last layer. It starts at zero, so that an untrained network predicts the mean trajectory."""
+    """The last layer. It starts at zero, so that an untrained network outputs zeros, which stand for the
+    reference trajectory if the objective is `clean`."""
 
     def __init__(self, settings: Any, waypoints: int, dof: int, features: int, condition: int) -> None:
         """settings: of the class that DENOISERS names for the denoiser.
@@ -146,7 +148,8 @@ class Block(nn.Module):
         self, width: int, heads: int, hidden: int, layers: int, causal: bool = False, cross: bool = False
     ) -> None:
         """layers: number of blocks in a row; the more, the smaller the initial weights of each.
-        cross: whether the tokens also attend to an encoder's tokens (the decoder of Vaswani et al. 2017).
+        cross: whether the tokens also attend to other tokens: those of an encoder (the decoder of Vaswani et
+            al. 2017), or those of the scene's points.
         """
         super().__init__()
         self.heads = heads
@@ -172,7 +175,7 @@ class Block(nn.Module):
         x: Tokens,
         memory: Float[Tensor, "batch others width"] | None = None,
     ) -> Tokens:
-        """memory: the encoder's tokens."""
+        """memory: the other tokens, if `cross`."""
         q, k, v = split_heads(self.qkv(self.norm_attention(x)), 3, self.heads)
         x = x + self.merge(attend(q, k, v, self.causal))
         if memory is not None:
@@ -188,8 +191,9 @@ class TrajectoryTransformer(Denoiser):
     - Encoder-only (the paper's motion predictor): a further token before those of the waypoints, z_tk,
       carries the condition and the noise level. z_tk may also be added to every other token.
     - Decoder-only (paper, Table 2; Radford et al. 2018): as encoder-only, with causal attention. z_tk is the
-      first token, so it is the only token that all waypoints attend to. One pass predicts all waypoints.
-    - With points: z_tk carries start, goal and level; each block also attends to the points of the scene.
+      first token, so all waypoints attend to it. One pass predicts all waypoints.
+    - With points: z_tk carries start, goal and level, and is added to every other token; each block also
+      attends to the points of the scene.
     - Encoder-decoder (paper, Table 2; Vaswani et al. 2017, with norms first): the encoder takes the tokens z,
       start, goal and t, and each block attends to the encoder's output. There is no z_tk.
     """

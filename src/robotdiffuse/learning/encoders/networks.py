@@ -199,7 +199,7 @@ DISTANCE_QUERIES = 96
 DISTANCE_WEIGHT = 4.0
 """Weight of the distance field's error [m] in the training loss, relative to the Chamfer distance [m]."""
 DISTANCE_CAP = 0.5
-"""Reconstructed distances are capped at this [m]."""
+"""True distances are capped at this before the reconstructed ones are compared with them [m]."""
 
 
 class PointAutoencoder(Autoencoder):
@@ -392,9 +392,9 @@ def neighbors(x: Features, near: Near, count: int) -> Int64[Tensor, "batch point
         # |a - b|^2 without |a|^2, which is the same for all neighbors of a
         squared_distances = torch.baddbmm(squared[:, None], x, x.mT, alpha=-2.0)
         squared_distances = squared_distances.masked_fill(~near[:, None], IGNORED_DISTANCE)
-        nearest = squared_distances.topk(min(count, x.shape[1]), dim=-1, largest=False, sorted=False)
+        closest = squared_distances.topk(min(count, x.shape[1]), dim=-1, largest=False, sorted=False)
         itself = torch.arange(x.shape[1], device=x.device)[:, None]
-        return torch.where(nearest.values < IGNORED_DISTANCE, nearest.indices, itself)
+        return torch.where(closest.values < IGNORED_DISTANCE, closest.indices, itself)
 
 
 class EdgeConvolution(nn.Module):

@@ -34,21 +34,21 @@ Trajectories = Float[ndarray, "n waypoints dof"]
 def random_scenes(count: int, max_obstacles: int, rng: Generator, rop: bool = False) -> PackedScenes:
     """Random scenes for training an encoder.
 
-    They are of three kinds in equal parts: two large obstacles as in ROP; several obstacles with the sizes of
-    dense ROP; any number of boxes and spheres of any size and orientation. rop: only scenes of the first
-    kind.
+    They are of three groups in equal parts: two large obstacles as in ROP; up to `max_obstacles` obstacles
+    with the sizes of dense ROP; up to `max_obstacles` boxes and spheres of very different sizes, half of them
+    turned. rop: only scenes of the first group.
     """
-    family = rng.integers(0, 1 if rop else 3, count)  # the kind of each scene
-    number = np.where(family == 0, 2, rng.integers(0, max_obstacles + 1, count))
+    group = rng.integers(0, 1 if rop else 3, count)  # of each scene
+    number = np.where(group == 0, 2, rng.integers(0, max_obstacles + 1, count))
     shape = (count, max_obstacles)
     kinds = np.where(rng.random(shape) < 0.5, SPHERE, BOX).astype(np.int8)
     kinds[np.arange(max_obstacles) >= number[:, None]] = NONE
     center = rng.uniform([-1.0, -1.0, 0.1], [1.0, 1.0, 1.0], (*shape, 3))
-    center[family == 2] *= rng.uniform([0.5, 0.5, 0.3], [1.0, 1.0, 1.2], (int((family == 2).sum()), 1, 3))
-    any_size = (family == 2)[:, None, None]
-    radius = np.where(family == 0, rng.uniform(0.18, 0.27, count), rng.uniform(0.06, 0.2, count))
+    center[group == 2] *= rng.uniform([0.5, 0.5, 0.3], [1.0, 1.0, 1.2], (int((group == 2).sum()), 1, 3))
+    any_size = (group == 2)[:, None, None]
+    radius = np.where(group == 0, rng.uniform(0.18, 0.27, count), rng.uniform(0.06, 0.2, count))
     radius = np.where(any_size[..., 0], rng.uniform(0.04, 0.3, shape), radius[:, None])
-    edge = np.where(family == 0, 0.2, rng.uniform(0.08, 0.3, count))[:, None, None]
+    edge = np.where(group == 0, 0.2, rng.uniform(0.08, 0.3, count))[:, None, None]
     size = np.where(any_size, np.exp(rng.uniform(np.log(0.03), np.log(0.9), (*shape, 3))), edge)
     turned = any_size & (rng.random((*shape, 1)) < 0.5)
     wxyz = np.where(turned, rng.standard_normal((*shape, 4)), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -90,12 +90,12 @@ class TrajectoryData:
         return np.flatnonzero(self.trivial), np.flatnonzero(~self.trivial)
 
     def draw(self, count: int, trivial_share: float, rng: Generator) -> Int[ndarray, "count"]:
-        """Indices of random rows. If the data have trivial and other rows, `trivial_share` of the drawn rows
-        are trivial."""
+        """Indices of random rows. If the data have trivial and other rows, each drawn row is trivial with the
+        probability `trivial_share`."""
         share = trivial_share if all(map(len, self.pools)) else float(len(self.pools[0]) > 0)
-        easy = rng.random(count) < share
+        trivial = rng.random(count) < share
         rows = np.empty(count, np.int64)
-        for mask, pool in zip((easy, ~easy), self.pools, strict=True):
+        for mask, pool in zip((trivial, ~trivial), self.pools, strict=True):
             rows[mask] = pool[rng.integers(0, max(len(pool), 1), int(mask.sum()))]
         return rows
 
@@ -126,9 +126,9 @@ def load_data(
         no copies are made if the robot's first joint does not rotate about the vertical.
     report: called with messages about the progress.
 
-    Codes are cached beside the shards, in files named by shard and encoder; if the folder cannot be written,
-    they are computed at every call. Raises InputError, naming the file, if there is no data set, a shard is
-    damaged, or the data are of another robot.
+    Embeddings are cached in the data folder, in files named by shard, encoder and turn; if the folder cannot
+    be written, they are computed at every call. Raises InputError, naming the file, if there is no data set,
+    a shard is damaged, or the data are of another robot.
     """
     if turned_copies and not turns_about_vertical(robot):
         report(f"data: no turned copies, as {robot.joint_names[0]} does not turn about the base's vertical")
@@ -167,7 +167,7 @@ def _embeddings(
     encoder: Encoder | None,
     key: str,
 ) -> Float[ndarray, "n embedding"]:
-    """Codes of scenes, cached in a file named by `key`; empty embeddings if there is no encoder."""
+    """Embeddings of scenes, cached in a file named by `key`; of size 0 if there is no encoder."""
     if encoder is None:
         return np.zeros((len(scenes), 0), np.float16)
     cache = folder / "codes" / f"{key}.npy"
@@ -286,7 +286,7 @@ class Batches:
         per_output = model.objective.clean_per_output(schedule.signal[levels], schedule.noise[levels])
         clamped = model.hold_ends(noisy.copy(), reference)
         return Batch(
-            features=model.features(clamped, reference, lambda at: self.clearances(scenes, at)),
+            features=model.features(clamped, reference, lambda joints: self.clearances(scenes, joints)),
             level=(levels / schedule.steps).astype(np.float32),
             condition=model.condition(embeddings, q[:, 0], q[:, -1]),
             clouds=clouds,

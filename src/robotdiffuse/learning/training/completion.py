@@ -127,11 +127,12 @@ class CompletionTraining(TrainingSettings):
 
 
 def train_completion(settings: CompletionTraining, out: str) -> dict[str, float]:
-    """Train the network; write completion.safetensors and completion.json into the folder `out`.
+    """Train the network; write completion.safetensors, .onnx and .json into the folder `out`.
 
-    The same call continues a run that was interrupted. Returns the cross-entropy per voxel on held-out
-    scenes, precision and recall by family, the expected calibration error, and `samples`. Raises the
-    errors of `loop.train`.
+    The same call continues a run that was interrupted. Returns, on held-out scenes, the cross-entropy per
+    voxel (`validation`) and the fitted temperature; precision, recall, average precision and expected
+    calibration error of each family; the expected calibration error over all families of the training; and
+    `samples`. Raises the errors of `loop.train`.
     """
     processes = Processes(settings.device)
     task = CompletionTask(settings, processes)
@@ -165,8 +166,8 @@ class CompletionTask(TrainingTask):
             pretrained = load_completion(None if settings.weights == BUNDLED_WEIGHTS else settings.weights)
             if pretrained.settings != settings.network:
                 raise InputError(
-                    f"weights {settings.weights} are of a network of {shown(pretrained.settings.to_json())}; "
-                    f"the training is of {shown(settings.network.to_json())}"
+                    f"weights {settings.weights} are for {shown(pretrained.settings.to_json())}; "
+                    f"the training's network has {shown(settings.network.to_json())}"
                 )
             network.load_state_dict(pretrained.state_dict())
         return network
@@ -246,8 +247,8 @@ class CompletionTask(TrainingTask):
         for part in _split(samples):
             hidden = ((part.seen & OCCUPIED) == 0) & self._above
             with torch.no_grad():
-                logits, truth, counted = self._logits_and_truth(part)
-            unknown = folded(torch.from_numpy(hidden)).reshape(-1)[counted].numpy().repeat(8)
+                logits, truth, indices = self._logits_and_truth(part)
+            unknown = folded(torch.from_numpy(hidden)).reshape(-1)[indices].numpy().repeat(8)
             predictions.append((logits.cpu().numpy().ravel(), truth.cpu().numpy().ravel(), unknown))
         logits, truth, unknown = (np.concatenate(parts) for parts in zip(*predictions, strict=True))
         return logits, truth, unknown
@@ -276,8 +277,8 @@ def calibration_error(p: Floats, truth: Flags) -> float:
     """Expected calibration error: the mean over the voxels of |mean predicted probability - share of occupied
     voxels| of their bins."""
     bins = np.minimum((p * CALIBRATION_BINS).astype(int), CALIBRATION_BINS - 1)
-    excess = np.bincount(bins, p.astype(np.float64) - truth, CALIBRATION_BINS)
-    return float(np.abs(excess).sum() / max(1, len(p)))
+    errors = np.bincount(bins, p.astype(np.float64) - truth, CALIBRATION_BINS)
+    return float(np.abs(errors).sum() / max(1, len(p)))
 
 
 def average_precision(p: Floats, truth: Flags) -> float:
