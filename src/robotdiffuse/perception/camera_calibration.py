@@ -32,7 +32,8 @@ from robotdiffuse.robots.robot import Robot
 GATES = np.geomspace(0.15, 0.012, 25)
 """For each round of the estimate, the distance beyond which points are too far from the arm to count [m]."""
 MAX_POINTS = 1500
-"""Approximate number of points of a view that an estimate uses."""
+"""Points of a view are thinned evenly while at least this many remain; so an estimate uses fewer than twice
+this number."""
 MODEL_CELL = 0.01
 """One point of the arm's surface is used in each cubic cell with this edge [m]."""
 NEIGHBORS = 10
@@ -50,7 +51,8 @@ class CameraCalibration:
     covariance: Float[ndarray, "6 6"]
     """Covariance of the camera's position [m] and rotation vector [rad], in the base frame."""
     agreement: float
-    """Fraction of the image cells that should show the arm whose depth is that of the arm's model."""
+    """Of the image cells in which the arm's model is visible, the fraction whose measured depth is the
+    model's."""
 
     @property
     def pose_deviation(self) -> tuple[float, float]:

@@ -23,7 +23,7 @@ NOTHING = Scene(())
 MIN_FOCAL_FRACTION = 0.05
 """Smallest focal length, as a fraction of the image's width and height: such an image spans 169 degrees."""
 MAX_INTRINSICS = 100.0
-"""Largest intrinsics, as fractions of the image's width and height."""
+"""Largest magnitude of fx and cx, as a multiple of the image's width, and of fy and cy, of its height."""
 MAX_THROUGH = 0.9
 """An image that sees through a larger fraction of the arm cannot be that of the stated camera."""
 MIN_CELLS = 40
@@ -31,8 +31,8 @@ MIN_CELLS = 40
 MIN_AGREEMENT = 0.6
 """If at least this fraction of the arm's cells has the arm's depth, the camera is correct to centimeters."""
 MIN_NAMED = 0.4
-"""A mistake is named only if at least this fraction agrees once it is undone. The fraction is below
-MIN_AGREEMENT, since objects in front of the arm may hide it."""
+"""A mistake is named only if undoing it gives more than this fraction of the arm's cells the arm's depth. The
+fraction is below MIN_AGREEMENT, since objects in front of the arm may hide it."""
 BETTER = 1.5
 """A mistake is named only if undoing it raises the agreement by at least this factor."""
 MIN_THROUGH = 0.35
@@ -63,7 +63,7 @@ def agreement(view: DepthView, robot: Robot, q: Configuration) -> tuple[float, f
 
 
 def implausible(view: DepthView) -> str:
-    """A message if the units of an image or its intrinsics cannot be right, of any scene; "" otherwise."""
+    """A message if the units of an image or its intrinsics cannot be right for any scene; "" otherwise."""
     height, width = view.depth.shape
     relative = np.abs(view.intrinsics) / (width, height, width, height)
     if view.cloud is None and (relative[:2].min() < MIN_FOCAL_FRACTION or relative.max() > MAX_INTRINSICS):
@@ -76,8 +76,9 @@ def implausible(view: DepthView) -> str:
 
 
 def contradiction(view: DepthView, robot: Robot, q: Configuration) -> str:
-    """What `camera_note` finds if the image sees through nearly all of the arm. Only for cameras beside the
-    arm: a camera on the arm sees it from so near that it may see past it with a small error of its pose."""
+    """What `camera_note` finds if the image sees through nearly all of the arm; "" otherwise. Only for
+    cameras beside the arm: a camera on the arm is so near that with a small error of its pose, it may seem to
+    see through the arm."""
     _, through, count = agreement(view, robot, q)
     return camera_note(view, robot, q) if count >= MIN_CELLS and through > MAX_THROUGH else ""
 
@@ -127,8 +128,8 @@ def _camera_note(view: DepthView, robot: Robot, joint_values: tuple[float, ...])
     best = ""
     highest = max(MIN_NAMED, BETTER * agreed if count >= MIN_CELLS else 0.0)
     for name, other in mistakes(view):
-        agrees, _, cells = agreement(other, robot, q)
-        if cells >= MIN_CELLS and agrees > highest:
+        agrees, _, other_count = agreement(other, robot, q)
+        if other_count >= MIN_CELLS and agrees > highest:
             best = name
             highest = agrees
     if best or count < MIN_CELLS or through < MIN_THROUGH:

@@ -52,15 +52,15 @@ SQUARE = 11
 """Edge of the squares in which flat surfaces are smoothed [pixels]."""
 FLATNESS = 2.0
 """A square is flat if the variance of inverse depth about the fitted plane is at most this many times the
-variance of the noise. With more, small objects would be taken for noise."""
+variance of the noise. With a larger factor, small objects would be taken for noise."""
 
 
 def smoothed(depth: Float32[ndarray, "h w"], spread: float) -> tuple[Float32[ndarray, "h w"], float]:
     """The image, smoothed on flat surfaces, and the share of smoothed pixels among the pixels with a return.
 
-    If the square of SQUARE pixels around a pixel is flat, the pixel gets the depth of the plane through the
-    square. On a plane, inverse depth is a linear function of the pixel, so its value in the middle is the
-    mean of the square. spread: standard deviation of depth at a distance of 1 m [m].
+    If the square of SQUARE x SQUARE pixels around a pixel is flat, the pixel gets the depth of the plane
+    through the square. On a plane, inverse depth is a linear function of the pixel, so its value in the
+    middle is the mean of the square. spread: standard deviation of depth at a distance of 1 m [m].
     """
     from scipy.ndimage import correlate1d, uniform_filter, uniform_filter1d
 
@@ -81,7 +81,7 @@ def smoothed(depth: Float32[ndarray, "h w"], spread: float) -> tuple[Float32[nda
 PATCH = 20
 """Edge of the patches on which noise is estimated [pixels]: several times the correlation length of errors
 that was measured on recorded sensors."""
-# An estimate needs at least MIN_PATCHES; at most about MAX_PATCHES, spread over the image, are used.
+# An estimate needs at least MIN_PATCHES; at most MAX_PATCHES, spread over the image, are used.
 MIN_PATCHES = 12
 MAX_PATCHES = 100
 MIN_PATCH_RETURNS = 0.7
@@ -90,13 +90,15 @@ FLAT_SHARE = 0.3
 """The image's noise is this quantile of its patches' noise, since patches with more noise contain edges or
 objects."""
 FIT_ROUNDS = 3
-"""Rounds of the fit of a plane; each round after the first ignores pixels beyond OUTLIER_SPREADS."""
+"""Rounds of the fit of a plane; each round after the first ignores pixels whose errors were larger than
+OUTLIER_SPREADS standard deviations, estimated from the median error of the patch."""
 OUTLIER_SPREADS = 3.0
 MIN_SPREAD = 4e-4
 """Images with less noise than this, at a distance of 1 m [m], are not filtered, since the filter removes
 objects that are one pixel wide."""
 MARGIN_SPREADS = 3.75
-"""Points within this many standard deviations of the filtered depth from the arm may belong to it."""
+"""Points may belong to the arm if their distance from it is at most this many standard deviations of the
+filtered depth."""
 MEDIAN_SPREAD = 0.4
 """Standard deviation of the median of nine independent numbers, relative to that of one number."""
 MEDIAN_LENGTH = 0.85
@@ -261,9 +263,9 @@ def empty_regions(
 
 
 GRAZED_WIDTH = 0.04
-"""A board that is seen almost edge-on gives no return, as open space does. So a pixel without a return does
-not show open space behind a surface if it is less than this beside it in the image, measured at the surface's
-depth [m]."""
+"""A board that is seen almost edge-on gives no return, as open space does. So a pixel without a return shows
+open space behind a surface only if its distance from the surface in the image, measured at the surface's
+depth, is larger than this [m]."""
 DEPTH_FACTOR = 1.5
 """Surfaces whose depths differ by less than this factor are widened by the same number of pixels."""
 
@@ -317,12 +319,12 @@ def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
         images: Depth images [m], at least two of the same size, of a camera and a scene at rest.
 
     Returns:
-        The spread and the correlation length, between the images or within flat patches of one image,
-        whichever has the larger spread; and the fraction of dropouts.
+        The spread and the correlation length, both measured between the images or both within flat patches
+        of one image, whichever gives the larger spread; and the fraction of dropouts.
 
     Raises:
-        InputError: For fewer than two images, for images of different sizes, and if no pixel has a
-            return in all images.
+        InputError: For fewer than two images, for images of different sizes, if no pixel has a return in
+            all images, and if the depths cannot be in meters.
 
     Examples:
         >>> rng = np.random.default_rng(0)
@@ -363,8 +365,8 @@ def pose_error(view: DepthView, distance: ArrayLike) -> Values:
 
 
 PointErrors = Float[ndarray, "n 2"]
-"""How far each point may be displaced [m]: by the error of the camera's pose, which displaces neighboring
-points alike, and by noise."""
+"""Two errors of each point [m]: how far the error of the camera's pose may displace it, which displaces
+neighboring points alike; and the standard deviation of the noise."""
 
 
 def point_errors(views: Iterable[DepthView], points: Points) -> PointErrors:
@@ -378,8 +380,8 @@ def point_errors(views: Iterable[DepthView], points: Points) -> PointErrors:
 
 
 def grown_for_errors(spheres: Float[ndarray, "n 4"], view: DepthView) -> Float[ndarray, "n 4"]:
-    """The arm's spheres in the base frame, inflated by the noise of depth at their distance and by the error
-    of the camera's pose."""
+    """The arm's spheres in the base frame, inflated by MARGIN_SPREADS times the noise of depth at their
+    distance and by the error of the camera's pose."""
     T = view.T_base_camera
     offset = spheres[:, :3] - T[:3, 3]
     forward = np.maximum(offset @ T[:3, 2], 0.0)

@@ -1,11 +1,12 @@
-"""Reads and writes the depth views of problem files, and reads depth images.
+"""Reads and writes the depth views of problem files, and reads depth images. A view has one of these forms:
 
 - {depth: shelf.png, scale: 0.001, intrinsics: [fx, fy, cx, cy], camera: {xyz: [...], wxyz: [...]}}
 - {depth: shelf.png, intrinsics: camera.json, camera: {...}}; without the field intrinsics, they are read from
   shelf.json, shelf.yaml, shelf.txt or shelf.npy
 - {cloud: shelf.ply, camera: {...}, configuration: [...]}
 
-Further fields are range, noise and pose_deviation, with the meaning that they have in DepthView.
+Further fields are configuration and pose_deviation and, for images, range and noise. They have the same
+meaning as in DepthView.
 """
 
 import warnings
@@ -157,9 +158,9 @@ def read_views(entries: object, folder: Path) -> tuple[tuple[DepthView, ...], tu
 
 def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthView:
     source: dict[str, str | float] | None = None
-    cloud = isinstance(entry, dict) and "cloud" in entry
-    required = ("cloud", "camera") if cloud else ("depth", "camera")
-    optional = ("configuration", "pose_deviation", *(() if cloud else IMAGE_FIELDS))
+    is_cloud = isinstance(entry, dict) and "cloud" in entry
+    required = ("cloud", "camera") if is_cloud else ("depth", "camera")
+    optional = ("configuration", "pose_deviation", *(() if is_cloud else IMAGE_FIELDS))
     values = check_fields(where, entry, required, optional)
     optional_fields = {
         name: values[name] for name in ("range", "pose_deviation") if values.get(name) is not None
@@ -170,7 +171,7 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
     rotation = rotation_from_quaternion(unit_quaternion("camera", camera["wxyz"]))
     T_base_camera = transform(vector("camera", "xyz", camera["xyz"], 3), rotation)
     configuration = values.get("configuration")
-    if cloud:
+    if is_cloud:
         points = values["cloud"]
         if isinstance(points, str):
             file = str(folder / points)

@@ -37,7 +37,7 @@ Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 HIT = np.float32(3.0)
 """A view with points in a voxel adds this to the voxel's evidence."""
 MISS = np.float32(2.0)
-"""A view that sees the whole voxel free subtracts this."""
+"""A view that sees a whole voxel free subtracts this from the voxel's evidence."""
 MOST_EVIDENCE = np.float32(8.0)
 """Evidence is clipped to ± this, so that a few views suffice to change a voxel's state."""
 COVER_RADIUS = MAP.edge * 3**0.5 / 2
@@ -48,8 +48,9 @@ class OccupancyMap:
     """Which voxels are free, occupied or unknown, from many views, each taken into account once.
 
     Voxels that a view sees through are free, and voxels that contain its points are occupied. Noisy images
-    are filtered first, so that stray pixels have no effect. Pixels without a return are ignored, and so are
-    points of the arm and of the objects that it holds. If views contradict each other, the majority decides.
+    are filtered first, so that stray pixels have no effect. Points of the arm and of the objects that it
+    holds are ignored, and so are pixels without a return, except where nothing seems to be within the range
+    that the view states. If views contradict each other, the sum of their evidence decides (see HIT).
 
     The voxels are those of `MAP`.
     """
@@ -61,8 +62,8 @@ class OccupancyMap:
         self._evidence = np.zeros(MAP.shape, np.float32)
         """Positive: occupied; negative: free; 0: unknown."""
         self._surely_free = np.zeros(MAP.shape, np.bool_)
-        """Voxels that a view saw free, even with the largest error of its pose, and no later view saw
-        occupied."""
+        """Voxels that a view saw free for every camera pose within the error of its pose, and that no later
+        view saw occupied."""
         self._doubted = np.zeros(MAP.shape, np.bool_)
         """See `doubt`."""
         self._seen_at = np.full(MAP.shape, -np.inf, np.float64)
@@ -78,8 +79,8 @@ class OccupancyMap:
     def add(self, view: DepthView, stamp: float = 0.0) -> int:
         """Take a view into account. Returns the number of voxels that it observes for the first time.
 
-        stamp: when the view was taken [s]. Its `configuration` is that of the arm at this time; without one,
-        or with one of the wrong length, InputError is raised.
+        stamp: when the view was taken [s]. The view's `configuration` is that of the arm at this time. Raises
+        InputError if the view has none, or one of the wrong length.
         """
         q = self.configuration_of(view)
         state, _, counts = carve_view(view, self.robot, q, MAP)
@@ -90,7 +91,8 @@ class OccupancyMap:
         return new_voxels
 
     def configuration_of(self, view: DepthView) -> Configuration:
-        """The arm's configuration at a view. Raises InputError without one or for a wrong length."""
+        """The arm's configuration in a view. Raises InputError if the view has none, or one of the wrong
+        length."""
         q = view.configuration
         if q is None or len(q) != self.robot.dof:
             raise InputError(
@@ -191,10 +193,11 @@ class OccupancyMap:
 MAX_VIEWS = 12
 """Default number of views that a ViewMemory keeps."""
 MUCH_BETTER = 0.8
-"""A kept view gets its refined pose once the deviation is below this fraction of its present deviation."""
+"""A kept view gets its refined pose once the deviation of the refined pose, meters plus radians, is below
+this fraction of the deviation of its present pose."""
 ALONE_DISTANCE = 0.02
-"""In noisy images, a point of one view with no other point within this distance is stray [m]. On surfaces at
-1 m, 99 of 100 points have at least three others within it."""
+"""If images are noisy, a point that only one view shows is stray if no other point is within this distance
+[m]. On surfaces at 1 m, 99 of 100 points have at least three others within this distance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +209,9 @@ class _RememberedView:
     """The view's configuration."""
     robot: Robot
     new_voxels: int
+    """Number of voxels that the view was the first to observe."""
     stated: DepthView
+    """The view with the pose that the caller stated."""
 
     @cached_property
     def volume(self) -> ObservedVolume:
@@ -258,8 +263,8 @@ class ViewMemory:
         return merged([memory.volume for memory in self._memories])
 
     def points(self, free: Voxels) -> tuple[Points, PointErrors]:
-        """The mean of the points that the kept views observed in each cell of a grid [m], see `seen_points`,
-        and how far each mean may be displaced, see `point_errors`.
+        """For each cell of a grid, the mean over the kept views that have a point there (see `seen_points`)
+        of these points [m]; and the errors of each mean, see `point_errors`.
 
         Stray points are left out: points in free voxels of the map (`free`), through which other views saw,
         and, in noisy images, points of a single view without another point nearby, because a surface gives

@@ -21,9 +21,9 @@ from robotdiffuse.scenes.scene import Scene
 
 SAME_SURFACE_PIXELS = np.float32(4.0)
 """Neighboring pixels are on the same surface if their depths differ by less than this many widths of a pixel
-at that depth, or as follows."""
+at that depth, or by less than SAME_SURFACE_FRACTION."""
 SAME_SURFACE_FRACTION = np.float32(0.01)
-"""Neighboring pixels are on the same surface if their depths differ by less than this fraction."""
+"""As a fraction of the depth; see SAME_SURFACE_PIXELS."""
 MAX_DEPTH = np.float32(1e6)
 """Larger depths are no returns [m]."""
 _NEAREST = np.float32(NEAREST)
@@ -65,11 +65,11 @@ def _key(x, y, z, voxel):
 
 
 @kernel(nogil=True)
-def gather(points, reach, spheres, voxel, keys, cells, sums, count):
+def gather(points, reach, spheres, voxel, keys, row_of, sums, count):
     """Adds points [3, n] to cells `voxel` wide. Returns the number of cells; -1 if `sums` is too small.
 
     Points beyond `reach` of the origin, NaN, and points inside one of the spheres [n, 4] are left out. keys,
-    int64, and cells, int32, are an open-addressing hash table from a cell's key to its row in `sums`; empty
+    int64, and row_of, int32, are an open-addressing hash table from a cell's key to its row in `sums`; empty
     slots have the key -1. sums [m, 4]: the sums of the coordinates and the number of points of each cell.
     count: number of cells in use.
     """
@@ -96,9 +96,9 @@ def gather(points, reach, spheres, voxel, keys, cells, sums, count):
             slot = _slot(keys, key)
             if keys[slot] == -1:
                 keys[slot] = key
-                cells[slot] = count
+                row_of[slot] = count
                 count += 1
-            rows[at] = cells[slot]
+            rows[at] = row_of[slot]
         row = sums[rows[at]]
         row[0] += x
         row[1] += y
@@ -151,20 +151,20 @@ def image_points(depth, intrinsics, T):
 
 
 @kernel(nogil=True)
-def supported(keys, cells, sums, count, least):
+def supported(keys, row_of, sums, count, least):
     """Which cells hold at least `least` points, or are next to a cell that does."""
     out = np.empty(count, np.bool_)
     for at in range(len(keys)):
         if keys[at] == -1:
             continue
-        is_supported = sums[cells[at], 3] >= least
+        is_supported = sums[row_of[at], 3] >= least
         for i in range(-1, 2):
             for j in range(-1, 2):
                 for k in range(-1, 2):
                     if not is_supported:
                         near = _slot(keys, keys[at] + (i << 42) + (j << 21) + k)
-                        is_supported = keys[near] != -1 and sums[cells[near], 3] >= least
-        out[cells[at]] = is_supported
+                        is_supported = keys[near] != -1 and sums[row_of[near], 3] >= least
+        out[row_of[at]] = is_supported
     return out
 
 
@@ -237,8 +237,8 @@ POINT_RADIUS = 0.01
 MIN_POINT_RADIUS = 0.001
 """Smallest radius of points near the arm at start or goal, so that they do not collide there [m]."""
 JOINED = 1.4
-"""Collision checks merge points that are larger than POINT_RADIUS and near each other into spheres of up to
-about this factor times their radius, so such points need more distance from the arm at start and goals."""
+"""Collision checks merge neighboring points with radii above POINT_RADIUS into spheres that are up to about
+this many times as large, so such points need more distance from the arm at start and goals."""
 ARM_DISTANCE = 0.02
 """Points within this distance of the arm, at its configuration in the view, are points of the arm [m];
 `grown_for_errors` adds an allowance for noise."""
@@ -249,8 +249,8 @@ REACH_MARGIN = 0.3
 MIN_CELL_POINTS = 3
 """Minimum number of points in an isolated cell; fewer points are sensor errors."""
 CAMERA_DISTANCE = 2.0
-"""Isolated cells with few points are left out only if every image has at least MIN_CELL_POINTS² pixels per
-cell at this distance [m]."""
+"""Isolated cells with few points are left out only if every view is an image that has at least
+MIN_CELL_POINTS² pixels per cell at this distance [m]."""
 INITIAL_CELLS = 1 << 16
 """Initial capacity of the table of cells."""
 
@@ -259,12 +259,12 @@ def seen_points(views: Sequence[DepthView], robot: Robot, start: Configuration) 
     """The mean of the observed points in each cell of a grid, in the base frame [m].
 
     Flying pixels, isolated cells with few points, points of the arm at its configuration in each view, and
-    points far beyond its reach are left out.
+    points far beyond the arm's reach are left out. start: the arm's configuration in views that state none.
     """
     capacity = INITIAL_CELLS
     while True:
         keys = np.full(4 * capacity, -1, np.int64)
-        cells = np.zeros(4 * capacity, np.int32)
+        row_of = np.zeros(4 * capacity, np.int32)
         sums = np.zeros((capacity, 4), np.float32)
         count = 0
         for view in views:
@@ -278,17 +278,17 @@ def seen_points(views: Sequence[DepthView], robot: Robot, start: Configuration) 
                 intrinsics = tuple(map(np.float32, view.intrinsics))
                 points = image_points(depth, intrinsics, view.T_base_camera.astype(np.float32))
             reach = np.float32(reach_bound(robot) + REACH_MARGIN)
-            count = gather(points, reach, spheres, np.float32(CELL), keys, cells, sums, count)
+            count = gather(points, reach, spheres, np.float32(CELL), keys, row_of, sums, count)
             if count < 0:
                 break
         if count >= 0:
-            # more than one point per isolated cell only if all images have enough pixels per cell
+            # isolated cells need more than one point only if all images have enough pixels per cell
             focal = min(
                 (0.0 if view.cloud is not None else view.intrinsics[0] for view in views), default=0.0
             )
             enough = (CELL * focal / CAMERA_DISTANCE) ** 2 >= MIN_CELL_POINTS**2
             min_points = np.float32(MIN_CELL_POINTS if enough else 1)
-            supported_cells = supported(keys, cells, sums, count, min_points)
+            supported_cells = supported(keys, row_of, sums, count, min_points)
             return sums[:count, :3][supported_cells] / sums[:count, 3:][supported_cells]
         capacity *= 4
 
@@ -308,8 +308,8 @@ def seen_shapes(
 END_SPREADS = 3.0
 """Noise of up to this many standard deviations must not make a free start or goal invalid."""
 ERROR_STEP = 0.005
-"""Errors of poses are rounded up to multiples of this; points of equal error and radius form one shape
-[m]."""
+"""Errors of poses are rounded up to multiples of this [m]. Points with equal rounded errors and equal radii
+form one shape."""
 
 
 def point_shapes(
@@ -328,9 +328,10 @@ def point_shapes(
     radius, at least MIN_POINT_RADIUS. Noise does not enlarge points, since it displaces some points of each
     surface towards the camera anyway.
 
-    Two kinds of points are left out because their errors may have displaced them: those inside the arm at
-    start or goals, or less than MIN_POINT_RADIUS outside, by at most the error of the pose plus END_SPREADS
-    times the noise; and those nearer to a known shape than KNOWN_DISTANCE plus the errors of pose and noise.
+    Two kinds of points are left out because their errors may have displaced them. Points of the first kind
+    are less than MIN_POINT_RADIUS outside the arm at start or goals, or inside it by at most the error of the
+    pose plus END_SPREADS times the noise. Points of the second kind are nearer to a known shape than
+    KNOWN_DISTANCE plus the error of the pose plus the noise.
 
     errors: see `point_errors`. enlarged: whether the error of the pose is added to the radius.
     """

@@ -156,12 +156,12 @@ def mark(spheres, low, voxel, marked):
 def surface(marked: Voxels) -> Int[ndarray, "n 3"]:
     """Indices of the marked voxels that share a face with an unmarked voxel of the grid, in the order of the
     array."""
-    inner = np.pad(marked, 1, constant_values=True)
-    within = marked.copy()
+    padded = np.pad(marked, 1, constant_values=True)
+    enclosed = marked.copy()
     for axis in range(3):
         for step in (-1, 1):
-            within &= np.roll(inner, step, axis)[1:-1, 1:-1, 1:-1]
-    return np.argwhere(marked & ~within)
+            enclosed &= np.roll(padded, step, axis)[1:-1, 1:-1, 1:-1]
+    return np.argwhere(marked & ~enclosed)
 
 
 @kernel(nogil=True)

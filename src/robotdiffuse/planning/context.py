@@ -83,7 +83,8 @@ class Solver(Protocol):
     name: ClassVar[str]
 
     def attempt(self, problem: Problem, request: PlanRequest) -> PlanResult:
-        """Plan from the problem's start to its goal, without its other fields."""
+        """Plan from the problem's start to its goal; `planning/pipeline` handles its waypoints, moving
+        obstacles, start velocity and views."""
         ...
 
 
@@ -272,10 +273,12 @@ class PlanningContext:
         """End a search that found no path.
 
         Args:
-            reason: Why there is no path; empty: that time ran out, or that the search ended.
+            reason: Why there is no path, unless the call has `ended`; empty: that time ran out, or that the
+                search ended.
 
         Returns:
-            A result with status TIMEOUT if time has run out, and NO_PATH if the search ended before.
+            A result with the status and reason that `finish` recorded, if it `ended` the call; else with
+            status TIMEOUT if time has run out, and NO_PATH if the search ended before.
         """
         if self._ended:
             return self.fail(*self._ended)
@@ -291,7 +294,7 @@ class PlanningContext:
         """Limit long steps to the time of the call.
 
         Returns:
-            A context manager within which they raise OutOfTimeError when time runs out.
+            A context manager within which these steps raise OutOfTimeError when time runs out.
         """
         return deadline(lambda: self.request.time_limit - self.elapsed)
 

@@ -30,7 +30,7 @@ def test_losses_that_are_not_finite_are_skipped(tmp_path: Path) -> None:
 def test_a_short_training_that_diverged_writes_no_weights(tmp_path: Path) -> None:
     settings = EncoderTraining(minutes=None, samples=3, batch=1)
     task = ToyTask(settings, lambda call: float("nan") if call > 1 else 1.0)
-    refuses("diverged: the loss is not finite at step 3", train, task, str(tmp_path))
+    refuses("diverged: the loss or its gradient is not finite at step 3", train, task, str(tmp_path))
 
 
 def test_the_average_follows_the_weights_with_the_decay_of_the_settings(tmp_path: Path) -> None:

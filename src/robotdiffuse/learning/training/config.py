@@ -67,14 +67,15 @@ class TrainingSettings(Settings):
     """Peak learning rate of AdamW."""
     warmup_steps: Natural = 500
     decay_share: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
-    """The learning rate falls in this last share of the run, along half a cosine."""
+    """Share of the run, at its end, in which the learning rate falls along half a cosine."""
     weight_decay: NotNegative = 0.0
     gradient_norm: Positive = 1.0
-    """Gradients are scaled down to this norm."""
+    """Gradients with a larger norm are scaled down to this norm."""
     average: ShareBelowOne = 0.9995
     """Decay of the moving average of the weights; the average is what is saved."""
     bad_steps: Count = 10
-    """After this number of consecutive steps with a loss that is not finite, training ends with an error."""
+    """After this number of consecutive steps in which the loss or its gradient is not finite, training ends
+    with an error."""
     threads: Annotated[int, Bound(least=1.0, most=1024.0)] = 1
     """Number of threads of PyTorch. While other processes keep the cores busy, one thread is several times
     faster than two."""
@@ -93,7 +94,8 @@ class TrainingSettings(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class EncoderTraining(TrainingSettings):
-    """Training of an auto-encoder of point clouds alone; it is frozen afterwards (paper, eq. l_AE)."""
+    """Training of an auto-encoder of point clouds without a planner (paper, eq. l_AE). Planners that are
+    trained with it later leave it unchanged."""
 
     name: str = "point_autoencoder"
     """Name of an encoder that is trained alone."""
@@ -217,6 +219,7 @@ JOINT_POINT_COLLISION = LossSettings(point=0.3, collision=0.05, begin=0.3, waypo
 for predictions with an error of 5 cm."""
 
 _TABLE2_ROW = {"clearance_features": False, "condition_drop": 0.1, "losses": JOINT_POINT_COLLISION}
+"""What the configs of the rows of the paper's table 2 share; "paper" and "points" use it as well."""
 
 
 class Config(NamedTuple):
@@ -315,5 +318,5 @@ def planner_training(name: str, given: dict[str, Any]) -> PlannerTraining:
     check_name("config", name, CONFIGS)
     changes = CONFIGS[name].changes | one_length(given)
     if "encoder" not in changes:
-        raise InputError(f"config {name} needs an encoder: name a folder with a trained one")
+        raise InputError(f"config {name} needs an encoder: name the folder of a trained encoder")
     return PlannerTraining(**changes)

@@ -48,8 +48,8 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 class Processes:
-    """The processes of a training, as one of them sees them. All processes must call the same methods in the
-    same order."""
+    """The processes of a training. Each process has its own object of this class, and all must call its
+    methods in the same order."""
 
     def __init__(self, device: str | None) -> None:
         """device: cpu, or cuda with a device for every process; None: cuda if there is one.
@@ -154,7 +154,8 @@ class Validation(NamedTuple):
     loss: float
     """Loss on held-out data."""
     success: float | None = None
-    """Share of held-out problems whose single sample is free; None: not measured."""
+    """Share of collision-free motions among samples for held-out problems; nan without such problems; None:
+    not measured."""
 
 
 class TrainingTask(ABC):
@@ -206,8 +207,8 @@ class Position:
 class TrainingRun:
     """Trains a module's parameters; continues an earlier run in the same folder.
 
-    A resumed run gives the same result as an uninterrupted run: weights, their average, moments of the
-    optimizer and the random states come from the checkpoint.
+    If `samples` sets its length, a resumed run gives the same result as an uninterrupted run: weights, their
+    average, moments of the optimizer and the random states come from the checkpoint.
 
     Several processes, started by torchrun, are one run: each draws its own batches of the size in the
     settings, and all step by their mean gradient. The first process validates, shows progress and writes all
@@ -250,7 +251,7 @@ class TrainingRun:
         return min(1.0, self.at.seconds / (60 * (self.settings.minutes or 1.0)))
 
     def loop(self) -> None:
-        """Train to the end. Ctrl-C stores a checkpoint first, then raises KeyboardInterrupt.
+        """Train to the end. On Ctrl-C or SIGTERM, store a checkpoint and raise KeyboardInterrupt.
 
         Raises InputError if another training uses the folder, or if the loss diverges.
         """
@@ -268,6 +269,7 @@ class TrainingRun:
                     self.step()
                     now = time.monotonic()
                     due = now - saved > self.settings.checkpoint_seconds
+                    # means: not 0 in all processes if one of them got a signal, or is due
                     elapsed, stopped, due = self.processes.mean(now - last, stop.is_set(), due)
                     self.at.seconds += elapsed
                     rate = self._samples_per_step / max(elapsed, 1e-9)
@@ -309,8 +311,8 @@ class TrainingRun:
 
     def diverged(self) -> NoReturn:
         raise InputError(
-            f"training in {self.out} diverged: the loss is not finite at step {self.at.step}; "
-            "use another folder and a lower learning rate"
+            f"training in {self.out} diverged: the loss or its gradient is not finite at step "
+            f"{self.at.step}; use another folder and a lower learning rate"
         )
 
     def _averaged(self, average: Tensor, parameter: Tensor, _count: Tensor | int) -> Tensor:
@@ -372,11 +374,11 @@ class TrainingRun:
             return
         self._plot()
         success = validation.success
-        planned = "" if success is None or math.isnan(success) else f"{success:.1%} of samples free, "
+        free_share = "" if success is None or math.isnan(success) else f"{success:.1%} of samples free, "
         console.print(
             f"{self.task.title}: {self.fraction:.1%}, {self.at.samples:,} samples in "
             f"{self.at.seconds / 60:.1f} min, loss {self.rows[-1]['loss']:.4f}, "
-            f"validation {validation.loss:.4f}, {planned}"
+            f"validation {validation.loss:.4f}, {free_share}"
             f"{self.at.skipped} steps skipped",
             highlight=False,
             soft_wrap=True,
@@ -474,8 +476,9 @@ def train(task: TrainingTask, out: str) -> dict[str, float]:
     """Train to the end and write the files into the folder `out`; returns the metrics.
 
     The same call continues a run that was interrupted. If torchrun started several processes, all of them
-    call this function and get the same result, see `TrainingRun`. Raises InputError if the folder holds a
-    different run, and KeyboardInterrupt, after a checkpoint, on Ctrl-C.
+    call this function and get the same result, see `TrainingRun`. Raises InputError if a package is missing,
+    the folder holds a different run, another training uses it, or the loss diverges; and KeyboardInterrupt,
+    after a checkpoint, on Ctrl-C or SIGTERM.
     """
     need_packages("training", *EXPORT_PACKAGES)  # checked now, not after hours of training
     run = TrainingRun(task, out)
@@ -531,7 +534,7 @@ class MotionTask(TrainingTask):
         """The loss of a random batch of these data."""
 
     def success(self, rng: Generator) -> float | None:
-        """Share of held-out problems that the network solves by itself; None: not measured."""
+        """As `Validation.success`."""
         return None
 
     def loss(self, fraction: float, rng: Generator) -> Scalar:

@@ -26,7 +26,7 @@ class ForwardKinematics:
     """Poses of a robot's frames at batches of configurations; differentiable any number of times.
 
     Configurations `q` [rad], or [m] for prismatic joints, have any batch shape. They are converted to `dtype`
-    and `device`, and the results have these too.
+    and moved to `device`; so the results are of this type and on this device.
 
     The frame of joint j is T[j + 1] = T[parents[j]] @ (C + cos(q) A + sin(q) B) with constant A, B and C.
     Each frame takes one small matrix product and two multiply-adds over the batch.
@@ -82,7 +82,7 @@ class ForwardKinematics:
 POINT_UNIT = 0.1
 """Distances in L_point and L_collision are divided by this [m], to be about as large as L_joint."""
 MAX_DISTANCE = 1.0
-"""Largest distance that is computed [m]; also the distance to an empty scene."""
+"""Larger distances of points from obstacles count as this [m]; so does the distance from an empty scene."""
 SAFE_DISTANCE = 0.05
 """S of the hinge h in L_collision [m]: distances below it are penalized."""
 EPSILON = 1e-12
@@ -101,7 +101,7 @@ class LossSettings(Settings, name="losses"):
     """Share of the training after which L_collision begins; its weight then rises over a tenth of the
     training. Earlier predictions are too far off for a meaningful gradient."""
     points: Count = 6
-    """Number of points of each link's surface in L_point."""
+    """Number of points on each link's surface in L_point."""
     waypoints: Count = 8
     """Number of waypoints, drawn anew for each batch, on which L_point and L_collision are computed."""
 
@@ -136,7 +136,7 @@ class SurfacePoints:
         self._local = torch.nn.functional.pad(local, (0, 1), value=1.0)
 
     def __call__(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch points 3"]:
-        """Positions of the points in the base frame [m]; q in [rad]."""
+        """Positions of the points in the base frame [m]; q in [rad], or [m] for prismatic joints."""
         T = self._kinematics(q)[..., self._frame, :3, :]
         return (T @ self._local[..., None])[..., 0]
 
@@ -156,7 +156,8 @@ class ArmDistance:
     def __call__(
         self, q: Float[Tensor, "n waypoints dof"], scenes: PackedScenes
     ) -> Float[Tensor, "n waypoints spheres"]:
-        """D of the paper [m], negative inside; q in [rad]. A floor counts as the plane of its top."""
+        """D of the paper [m], negative inside; q in [rad], or [m] for prismatic joints. A floor counts as the
+        plane of its top."""
         T = self._kinematics(q)[..., self._frame, :3, :]
         centers = (T[..., :3] * self._centers[:, None]).sum(-1) + T[..., 3]
         at = centers.movedim(-1, 0).flatten(2).contiguous()

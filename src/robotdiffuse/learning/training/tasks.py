@@ -64,7 +64,7 @@ from robotdiffuse.scenes.scene_arrays import PackedScenes
 STANDARDIZATION_SCENES = 2048
 """Number of scenes over which the components of the embedding z are standardized."""
 REGULARIZATION = 1e-7
-"""The paper's lambda: factor of the sum of the network's squared weights, which is added to the loss."""
+"""The paper's lambda. The loss contains this times the sum of squares of the weights `penalized()`."""
 
 
 def train_encoder(settings: EncoderTraining, out: str) -> dict[str, float]:
