@@ -72,7 +72,7 @@ class Motion:
 
 
 Measure = Callable[[Motion], float | None]
-"""Returns the value of a metric in SI units, as in records; None if the motion does not have it."""
+"""Returns the value of a metric in SI units, as in records; None if the motion has no such value."""
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,7 @@ class GenerationSettings(Settings):
     """Spacing of waypoints: evenly in joint-space length (arc), or in time by time parameterization
     (time)."""
     shard: Count = 500
-    """Number of trajectories in a shard. An interruption loses at most one shard per worker."""
+    """Number of trajectories in a shard. An interruption loses only the shards that are being made."""
     planner: Annotated[str, OneOf(SEARCHES)] = "shared_tree_rrt_star"
     """Planner that solves the problems; the default is the paper's."""
     search: Annotated[SharedTreeSettings | AORRTCSearchSettings, SettingsOf("planner", SEARCHES)] = field(

@@ -50,8 +50,8 @@ TRAJECTORY_ENDINGS = (".json", ".csv")
 
 
 def check_export(file: str | Path, *inputs: str) -> Path:
-    """The file as a path, after checking that its format is known, its package installed, and it can be
-    written.
+    """The file as a path, after checking that its format is known, that the package of the format is
+    installed, and that the file can be written. The last check is left out for an existing bag folder.
 
     Raises InputError for an ending that is not in WRITERS or TRAJECTORY_ENDINGS, for a package that is not
     installed, for a folder that is missing or read-only, and if the file is one of `inputs`.

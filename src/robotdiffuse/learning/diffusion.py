@@ -135,7 +135,7 @@ class Objective:
         return output
 
     def clean_per_output(self, signal: Any, noise_level: Any) -> Any:
-        """d clean / d output: how an error of the output scales into the clean trajectory."""
+        """d clean / d output: factor from an error of the output to the error of the clean trajectory."""
         return 0 * signal + 1
 
     def weight(self, schedule: NoiseSchedule, t: Int[ndarray, "n"], limit: float | None) -> Values:

@@ -340,8 +340,8 @@ class MotionModel(ABC):
         start: Joints,
         goal: Joints,
     ) -> Float[ndarray, "*batch condition"]:
-        """C = [z, start, goal]; start and goal are normalized. Without an encoder, C is a single zero, because
-        the condition of a denoiser must not be empty."""
+        """C = [z, start, goal]; start and goal are normalized. Without an encoder, C is a single zero: the
+        condition of a denoiser must not be empty."""
         if self.settings.encoder is None:
             return np.zeros((*np.shape(start)[:-1], 1), np.float32)
         ends = [self._unit(q) for q in (start, goal)]

@@ -166,7 +166,7 @@ class CompletionTask(TrainingTask):
             pretrained = load_completion(None if settings.weights == BUNDLED_WEIGHTS else settings.weights)
             if pretrained.settings != settings.network:
                 raise InputError(
-                    f"weights {settings.weights} are for {shown(pretrained.settings.to_json())}; "
+                    f"weights {settings.weights}: their network has {shown(pretrained.settings.to_json())}; "
                     f"the training's network has {shown(settings.network.to_json())}"
                 )
             network.load_state_dict(pretrained.state_dict())
