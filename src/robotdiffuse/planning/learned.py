@@ -1,4 +1,4 @@
-"""The base class of planners with a network: finds and loads the weights."""
+"""The base classes of planners with a network, which find and load the weights."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -89,7 +89,8 @@ class Attempt(NamedTuple):
 
 
 def ranked(space: Space, paths: Iterable[Configurations]) -> list[Attempt]:
-    """The paths with the fewest segments in collision first, and of these the shortest first."""
+    """The paths with the fewest segments in collision first; among paths with equally many, the shortest
+    first."""
     attempts = [
         Attempt(int((~motions_free(space, path)).sum()), float(path_length(path)), path) for path in paths
     ]

@@ -69,6 +69,7 @@ TOLERANCES = 1e-9, 1e-9
 """Tolerances of inverse kinematics at the poses [m], [rad]. They are small, because the second derivative of
 the curve divides errors by the square of the step."""
 ROUND = InverseKinematicsSettings(max_rounds=1)
+"""For the search for other configurations of the end pose, see OTHER_ENDS."""
 
 
 def follow_line(context: PlanningContext) -> PlanResult | None:
@@ -109,7 +110,7 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
 
     def tried(end: Float[ndarray, "dof"] | None) -> bool:
         """Whether the line can be followed to its last pose, while joints are steered to the configuration
-        `end` if it is given. The motion becomes a candidate if it ends there."""
+        `end` if it is given. The motion becomes a candidate if it ends in this configuration."""
         nonlocal fraction, why
         rows = _followed(problem, line, targets, *chain, end)
         fraction_followed = (len(rows) - 1) / len(targets)
@@ -182,7 +183,8 @@ def faster_ends(
     rows: Float[ndarray, "k dof"],
     cost: Callable[[Float[ndarray, "k dof"]], float],
 ) -> list[tuple[float, Float[ndarray, "k dof"]]]:
-    """Costs and motions along the line that end in other configurations of the end pose than `rows`.
+    """Costs and motions along the line that end in the last configuration of `rows`, or in other
+    configurations of the end pose.
 
     arm, joints: from `ik_chain`. Each returned motion has a lower cost than `best_cost` and than the motions
     before it, and is at most LONGER times as long as `rows`.
@@ -205,13 +207,13 @@ def faster_ends(
             solutions = solve_seeds(seed[None], seed[None][:0], 1, joints, targets[-1], parameters)[0]
             moved = end.copy()
             moved[arm] = solutions[0] if len(solutions) else seed
-            rows = _followed(problem, line, targets, arm, joints, moved)
-            arrived = len(rows) > len(targets) and np.abs(rows[-1] - moved).max() < SAME
-            estimated = cost(rows) if arrived and path_length(rows) <= max_length else np.inf
+            again = _followed(problem, line, targets, arm, joints, moved)
+            arrived = len(again) > len(targets) and np.abs(again[-1] - moved).max() < SAME
+            estimated = cost(again) if arrived and path_length(again) <= max_length else np.inf
             if estimated >= best_cost:
                 break
             best_cost = estimated
-            faster.append((best_cost, rows))
+            faster.append((best_cost, again))
     return faster
 
 

@@ -38,8 +38,9 @@ class Planner(ABC, Generic[PlannerSettings]):
     name: ClassVar[str]
     settings_class: type[PlannerSettings]
     supports: ClassVar[frozenset[str]] = frozenset()
-    """Which of the features PATH_CONSTRAINTS and CLEARANCE the planner supports; `plan` refuses requests for
-    the others. `plan` handles everything else that a problem or a request may contain, for every planner."""
+    """Which of the features PATH_CONSTRAINTS and CLEARANCE the planner supports; `plan` refuses problems and
+    requests that need a feature that is not among these. `plan` handles everything else that a problem or a
+    request may contain, for every planner."""
 
     follows_lines: ClassVar[bool] = False
     """If a constraint of the problem is a `CartesianLine`: whether `line_following.py` is tried before
@@ -145,7 +146,8 @@ class Planner(ABC, Generic[PlannerSettings]):
             request: The arguments of the call.
 
         Returns:
-            The result of `solve`, or of the call that failed before it.
+            The result of `solve`, or of following a line if that succeeds; a failed result if start or goal
+            cannot be used, or if time runs out.
         """
         context = PlanningContext(self.name, problem, request)
         followed = None

@@ -25,8 +25,8 @@ SEEDS = 64
 """Number of seed configurations of inverse kinematics in a round."""
 ROUND = InverseKinematicsSettings(seeds_per_round=SEEDS, max_rounds=1)
 """Settings of one round of inverse kinematics for a pose without tolerances."""
-# Number of rounds: at most MAX_ROUNDS; once a configuration is found, rounds end after PATIENCE rounds in a
-# row without a new one; if no configuration reached the pose after REACH_ROUNDS, the pose is given up.
+# Number of rounds: at most MAX_ROUNDS. Once a configuration is found, rounds end after PATIENCE rounds in a
+# row without a new one. If REACH_ROUNDS + 1 rounds find no configuration at the pose, the pose is given up.
 MAX_ROUNDS = 64
 PATIENCE = 2
 REACH_ROUNDS = 16
@@ -82,20 +82,20 @@ def pose_configurations(
     stale_rounds = 0
     for k in range(rounds):
         check_time("configurations of the goal pose")
-        seed_count = count if k == 0 else SEEDS
+        most = count if k == 0 else SEEDS
         # Projection ends at the boundary of the tolerances; to find configurations inside, every other round
         # uses only a fraction of the tolerances.
         aims = poses
         if k % 2:
             fraction = rng.uniform()
-            aims = [_within(pose, fraction) for pose in poses]
-        new = [at_pose(problem, aim, seed_count, rng, exact) for aim in aims]
-        solutions = [np.concatenate([before, more]) for before, more in zip(solutions, new, strict=True)]
-        seeds = new[0] if len(poses) == 1 else _combined(problem, poses, solutions, rng)
+            aims = [_tightened(pose, fraction) for pose in poses]
+        new = [at_pose(problem, aim, most, rng, exact) for aim in aims]
+        solutions = [np.concatenate([earlier, more]) for earlier, more in zip(solutions, new, strict=True)]
+        found = new[0] if len(poses) == 1 else _combined(problem, poses, solutions, rng)
         if len(poses) > 1 or problem.constraints:
-            seeds = all_constraints.projected(np.concatenate([start[None], seeds]), GOAL_TOLERANCE_FRACTION)
-        reached = reached or len(seeds) > 0
-        accepted = _accepted(robot.nearest_turns(seeds, start), accept)
+            found = all_constraints.projected(np.concatenate([start[None], found]), GOAL_TOLERANCE_FRACTION)
+        reached = reached or len(found) > 0
+        accepted = _accepted(robot.nearest_turns(found, start), accept)
         before = len(configurations)
         configurations = _distinct(np.concatenate([configurations, accepted]))[:count]
         stale_rounds = 0 if len(configurations) > before else stale_rounds + 1
@@ -143,7 +143,7 @@ def at_poses(
         yield robot.nearest_turns(configurations, start)
 
 
-def _within(pose: PoseGoal, fraction: float) -> PoseGoal:
+def _tightened(pose: PoseGoal, fraction: float) -> PoseGoal:
     """The pose with its tolerances multiplied by `fraction`; an unconstrained angle stays unconstrained."""
     xyz = pose.xyz_tolerance
     rpy = pose.rpy_tolerance
@@ -157,9 +157,9 @@ def _within(pose: PoseGoal, fraction: float) -> PoseGoal:
 def _combined(
     problem: Problem, poses: Sequence[PoseGoal], solutions: Sequence[ndarray], rng: np.random.Generator
 ) -> Configurations:
-    """Seeds for several poses: random combinations of `solutions`, which are, for each pose, configurations
-    that reach this pose alone. A joint that moves several links takes its value from one pose's
-    configuration, chosen at random. No rows if there is no configuration for some pose."""
+    """Seeds for several poses: random combinations of `solutions`. These are, for each pose, configurations
+    that reach it, regardless of the other poses. A joint that moves several links takes its value from the
+    configuration for one of their poses, chosen at random. No rows if some pose has no configuration."""
     seeds = np.tile(problem.start, (SEEDS if all(len(rows) for rows in solutions) else 0, 1))
     for k in rng.permutation(len(poses)):
         moving = ~on_other_arm(problem.robot, poses[k].frame)

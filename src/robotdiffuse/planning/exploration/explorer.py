@@ -5,16 +5,17 @@ an image. Motions follow one of two policies.
 
 **Strict.** The arm enters only voxels that were seen free: the validator accepts each motion among obstacles
 that cover all other space (`seen_free.py`). There are two exceptions: voxels with centers within 3 cm of the
-arm at the start of a motion, and the space within 2 cm of the arm at its end. Seen points are obstacles there
-as well. With `see_goal`, the arm's surface at the goal must also have been seen free (`seen_free.GoalSeen`).
-The promise is as good as the map: if the scene does not change, and the camera's poses and errors are as
-stated, such a motion does not collide. Seen points may be displaced by the error of their camera's pose.
-Space that is nearer to a seen point than this error counts as free only if some view shows it free for every
-camera pose within the error of that view's pose. Views from nearby can show this.
+arm at the start of the motion, and the space within 2 cm of the arm at the end of the motion. Seen points are
+obstacles even there. With `see_goal`, the arm's surface at the goal must also have been seen free
+(`seen_free.GoalSeen`). The promise is as good as the map: if the scene does not change, and the camera's
+poses and errors are as stated, such a motion does not collide. Seen points may be displaced by the error of
+their camera's pose, and an obstacle may be anywhere within this error of a seen point. This space counts as
+free only if some view shows it free for every camera pose within the error of that view's pose. Views from
+nearby can show this.
 
 **Probabilistic.** The arm executes a motion whose stated `confidence` is high enough, and otherwise looks
 first. The confidence follows from the predicted occupancy probabilities of the unknown voxels that the motion
-sweeps, except voxels that the arm fills at the start or at the end.
+sweeps, except voxels that the arm fills at the start or at the goal.
 
 To choose a viewpoint, the Explorer plans a tentative motion to the goal among only the seen obstacles. Views
 should show the unseen space that this motion would sweep. The motion to a viewpoint is subject to the policy
@@ -186,8 +187,8 @@ class Explorer:
             stamp: Time of the exposure [s]; older evidence is forgotten after `max_age`.
 
         Raises:
-            InputError: For a view that does not fit the robot, whose depths are not in meters, or that sees
-                through the arm.
+            InputError: For a view that does not fit the robot, whose depths are not in meters, whose
+                intrinsics do not fit its image, or that sees through the arm.
         """
         q = self.map.configuration_of(view)
         wrong = implausible(view)
@@ -332,10 +333,12 @@ class Explorer:
         predicted: Probabilities | None,
         motion: PlanResult,
     ) -> Step:
-        """The step after no motion to the goal kept to the policy: GO, if a tentative motion does; else LOOK,
-        at the unseen space that it sweeps or from farther back on the way in; else STUCK, with the reason.
+        """The step if the search for a motion under the policy failed: GO if a tentative motion keeps to the
+        policy; else LOOK, at the unseen space that this motion sweeps or from farther back on the way in;
+        else STUCK, with the reason.
 
-        motion: the motion to the goal that does not keep to the policy, or the failed result.
+        motion: what the search returned: a motion to the goal that does not keep to the policy, or a failed
+        result.
         """
         why = self._goal_seen.missing(motion) or motion.reason
         if motion.solved and policy == PROBABILISTIC:
@@ -388,7 +391,7 @@ class Explorer:
         allowed = self._seen_free(problem) if policy == STRICT else problem
         tree = ReachableTree(self.robot, allowed.scene, problem.start)
         way_in = self._way_in_to(problem.start)
-        # going back along the latest motion would not help: there is none, or it was short
+        # whether going back along the latest motion would not help: there is none, or it was short
         hemmed_in = way_in is None or bool(moved(self.robot, way_in[:1], [problem.start])[0] < CONFINED)
         taken = self._goal_seen.taken
         for camera in self.cameras:

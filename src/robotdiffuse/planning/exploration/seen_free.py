@@ -3,7 +3,7 @@ arm fills at a goal was seen free (`GoalSeen`).
 
 For the goal, voxels of 2 cm are too coarse: voxels that the arm touches there are rarely seen free as a
 whole. So small balls cover the arm's surface at the goal, and each ball must be free for one of four reasons:
-an image sees through it, which means that all of its pixels measure surfaces behind it; it lies in voxels
+an image sees through it, which means that all returns of its pixels are from behind it; it lies in voxels
 that the map knows to be free; a covering sphere of the arm contained it when an image was taken; or it is so
 near the arm at the start of the motion that it counts as free. The space inside the surface needs no view,
 since obstacles do not float.
@@ -212,6 +212,7 @@ class GoalSeen:
             assert view.configuration is not None  # the map takes no other views
             depth, _ = usable_image(view, self._robot, view.configuration, 0.0)
             noise = MARGIN_SPREADS * filtered(view).edge_spread
+            # balls that the arm contained; `see_through` adds those that the image sees through
             seen = self._distances(balls, view.configuration) < -BALL_RADIUS
             see_through(
                 depth,

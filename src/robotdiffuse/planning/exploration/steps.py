@@ -110,8 +110,8 @@ class Step:
     policy: str = ""
     """The policy that the motion keeps, "strict" or "probabilistic"."""
     motion: PlanResult | Any = None
-    """A solved result. A strict motion is certified against obstacles that cover all space not seen free;
-    `motion.problem` holds them."""
+    """A solved result; None if the arm shall stay. A strict motion is certified against obstacles that cover
+    all space not seen free; `motion.problem` holds these obstacles."""
     confidence: float | None = None
     """Stated probability that a motion is free, under the probabilistic policy."""
     seen: Scene | None = None
@@ -119,5 +119,5 @@ class Step:
     planned."""
     wanted: Voxels | None = None
     """The voxels that the next view should show: voxels that no view saw and that the arm would pass through
-    on a motion to the goal, planned as if unseen space were free, or would fill at the goal. None for other
-    steps."""
+    on a motion to the goal, planned as if unseen space were free, or would fill at the goal. None if the step
+    asks for no view of particular voxels."""

@@ -63,11 +63,11 @@ def stop_before(
     motion: Trajectory,
     time: float,
 ) -> Stop | None:
-    """A stop that begins at `time`, as early as possible, if views show an obstacle in the way of the rest of
-    the motion; otherwise None.
+    """A stop that begins at `time` and comes to rest as early as possible, if views show an obstacle in the
+    way of the rest of the motion; otherwise None.
 
     The stop is within the robot's limits of velocity, acceleration and jerk. Points in space that was free
-    before belong to an object that appeared; they are padded, since only its front is seen.
+    before belong to an object that appeared; these points are padded, since only the object's front is seen.
 
     views: views taken during the motion. free: `OccupancyMap.free` when the motion was planned. time: when a
     new command takes effect, in time of the motion [s]. Raises InputError for a time outside the motion.
@@ -100,7 +100,8 @@ def _within(points: Points, free: Voxels) -> Bool[ndarray, "n"]:
 
 def braked(robot: Robot, motion: Trajectory, time: float) -> Trajectory:
     """The motion from `time` on, slowed to rest after as little of the path as the limits allow. It stays on
-    the path. Braking for b seconds uses up b / 2 of the motion's time."""
+    the path. If no braking that was tried keeps the limits, it is the rest of the motion. Braking for b
+    seconds uses up b / 2 of the motion's time."""
     best = _rows(motion, time, motion.duration - time, 0.0, RAMPS[0])
     stop_time = motion.duration
     for delay in np.arange(0.0, motion.duration - time, BRAKING_DELAY):

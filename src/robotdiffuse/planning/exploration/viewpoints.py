@@ -102,9 +102,9 @@ SPREADS = (0.3, 0.8, 2.0)
 LONGEST_STEP = 1.0
 """Longest extension towards a target [rad, joint-space L2]; most are much shorter, to pass gaps."""
 REFINEMENTS = (0.25, 0.1)
-"""Standard deviations of the targets about the configurations of the best scores, in two further rounds
-[rad]."""
-# Number of these configurations, and of targets about each of them.
+"""In each of two further rounds, the standard deviation of the targets about the configurations with the best
+scores [rad]."""
+# Number of configurations with the best scores, and of targets about each of them.
 REFINED = 12
 NEIGHBORS = 15
 MAX_VOXELS = 1500
@@ -116,10 +116,12 @@ UNSEEN_WEIGHT = 0.05
 MIN_SEEN = 0.02
 """Viewpoints that see a smaller part of the total weight are not used."""
 CONFINED = 0.1
-"""An arm that can move no farther than this [m] is confined by unseen space, which the arm itself hides from
-the fixed cameras. The arm first moves as far as it can, so that these cameras see that space."""
+"""An arm that can move (see `moved`) no farther than this [m] is confined by unseen space, which the arm
+itself hides from the fixed cameras. The arm first moves as far as it can, so that these cameras see the space
+that it left."""
 SIMILAR_LOOK = 0.2
-"""A viewpoint nearer than this to an earlier one that did not show the wanted voxels counts less [rad]."""
+"""A viewpoint counts less if no joint is farther than this [rad] from an earlier viewpoint that did not show
+the wanted voxels."""
 
 
 def swept_unseen(known: OccupancyMap, path: Path) -> Voxels:
@@ -154,9 +156,8 @@ def best_viewpoints(
     taken: configurations of earlier images that did not show the wanted voxels. Each of them lowers the score
     of viewpoints nearby.
     hemmed_in: whether the arm cannot go back far enough along its latest motion. If so, the last path leads
-    to the configuration in which the arm is farthest from the start and from all of `taken`. If even that
-    one is nearer than CONFINED, its path also comes first.
-
+    to the configuration in which the arm is farthest from the start and from all of `taken`. If even this
+    configuration is nearer than CONFINED, the path to it also comes first.
     beside: the latest image of a fixed camera. With the arm at a viewpoint, this camera may see wanted voxels
     that the arm hides now.
     """
@@ -236,8 +237,8 @@ class NextView(Value):
     T_base_camera: Pose
     """Pose of the camera [4, 4]."""
     seen: float
-    """Fraction of this space that a camera with this pose is expected to see, weighted by the probability
-    that the space is occupied."""
+    """Fraction of the unknown space on the motion that a camera with this pose is expected to see, weighted
+    by the probability that the space is occupied."""
 
 
 def poses_around() -> list[Pose]:

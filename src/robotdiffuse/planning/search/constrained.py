@@ -23,20 +23,21 @@ from robotdiffuse.problems.constraint_kernel import evaluate, make_work, proved
 from robotdiffuse.problems.projection_kernel import project
 
 MAX_DEPTH = 9
-"""Largest number of times that an edge is halved."""
+"""Largest number of ends of pieces that `between` has yet to reach; it grows by one with each halving."""
 MIN_PIECE = 0.004
 """Pieces shorter than this are not halved [rad]."""
 MAX_PIECES = 512
 """Largest number of straight pieces of an edge."""
 MAX_GROWTH = 0.2
-"""Along a straight piece, the value of a constraint row may exceed its values at both ends by this fraction
-of the row's tolerance."""
+"""Along a straight piece, the value of a constraint row may exceed the larger of its values at the two ends
+by this fraction of the row's tolerance."""
 MIN_PROOF_PIECE = 1 / 16
 """Shortest part of a piece in a proof, as a fraction of the piece's length."""
 MAX_DRIFT = 0.85
 """Largest distance of a projected middle from either end, as a fraction of the piece's length."""
 MIN_APPROACH = 0.95
-"""Largest distance to the target after an extension, as a fraction of the distance before."""
+"""Largest distance to the target after an extension, as a fraction of the distance before. If the target is
+more than ten steps away, it suffices to come nearer by half a step."""
 MAX_STEP_FACTOR = 2.0
 """Largest ratio of the length of an edge to the length of the straight line that it replaces."""
 SHORTCUT_GAIN = 0.99
