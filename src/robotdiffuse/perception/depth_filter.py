@@ -221,11 +221,11 @@ def empty_regions(
     depth: Float32[ndarray, "h w"], reach: float | None = None, arm: Bool[ndarray, "h w"] | None = None
 ) -> Bool[ndarray, "h w"] | None:
     """The pixels without a return (0 or NaN) where nothing seems to be in range: large regions at the border
-    of the image with no near surface beside them. None if no pixel is such, or if the image is cropped.
+    of the image with no near surface beside them. None if there is no such pixel, or the image is cropped.
 
     Regions that do not reach the border are left out, since they may be dark or reflecting surfaces. reach:
-    the sensor's range [m] if known; an image in which returns end near it along one row, as on a floor, is
-    not cropped. arm: the pixels of the arm, which may be closer than TOO_NEAR.
+    the sensor's range [m] if known; an image in which returns end along one row because a surface, such as
+    the floor, leaves the range is not cropped. arm: the pixels of the arm, which may be closer than TOO_NEAR.
     """
     no_return = ~(depth > 0)
     lost = no_return[::2, ::2]

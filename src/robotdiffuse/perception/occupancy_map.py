@@ -56,7 +56,8 @@ class OccupancyMap:
     """
 
     def __init__(self, robot: Robot, max_age: float | None = None) -> None:
-        """max_age: evidence older than this is forgotten [s]; None: never."""
+        """max_age: evidence that is older than the latest view by more than this is forgotten [s]; None:
+        never."""
         self.robot = robot
         self.max_age = max_age
         self._evidence = np.zeros(MAP.shape, np.float32)

@@ -44,8 +44,8 @@ ShareBelowOne = Annotated[float, Bound(least=0.0, below=1.0)]
 
 
 def one_length(given: dict[str, Any]) -> dict[str, Any]:
-    """The given settings. If they set the length of the run, by `minutes` or `samples`, the other one becomes
-    None, since it may have a default; `minutes` wins if both are given."""
+    """The given settings. If `minutes` is given, `samples` becomes None; if only `samples` is given, `minutes`
+    becomes None, since it may have a default."""
     if given.get("minutes") is not None:
         return given | {"samples": None}
     return given if given.get("samples") is None else given | {"minutes": None}
@@ -164,8 +164,8 @@ class PlannerTraining(MotionTraining, ModelParts):
     """Whether the denoiser's tokens are means of blocks of waypoints in most of the training, and single
     waypoints only at its end; see `STAGES`. Steps with fewer tokens take a fraction of the time."""
     validation_problems: Natural = 32
-    """Number of held-out problems that are sampled at every checkpoint: without guidance, except for a prior,
-    which is sampled with it."""
+    """Number of held-out problems for which motions are sampled at every checkpoint: with guidance for a
+    prior, otherwise without guidance."""
     encoder_settings: Annotated[EncoderSettings | None, SettingsOf("encoder", ENCODERS)] = None
     """Settings of an encoder that is trained jointly; None: its defaults."""
     denoiser_settings: Annotated[DenoiserSettings | None, SettingsOf("denoiser", DENOISERS)] = None

@@ -142,7 +142,8 @@ class SurfacePoints:
 
 
 class ArmDistance:
-    """Signed distance of an arm's covering spheres to packed scenes, one scene for each trajectory."""
+    """Signed distance of the covering spheres of an arm's moving links to packed scenes, one scene for each
+    trajectory."""
 
     def __init__(self, kinematics: ForwardKinematics) -> None:
         arrays = compile_robot(kinematics.robot)

@@ -184,7 +184,8 @@ class Explorer:
 
         Args:
             view: A depth image, with the pose of its camera and the configuration of the arm at the exposure.
-            stamp: Time of the exposure [s]; older evidence is forgotten after `max_age`.
+            stamp: Time of the exposure [s]; evidence older than the latest view by more than `max_age` is
+                forgotten.
 
         Raises:
             InputError: For a view that does not fit the robot, whose depths are not in meters, whose
@@ -311,13 +312,13 @@ class Explorer:
                 return self._go(motion, policy)
         return look
 
-    def _good(self, motion: PlanResult, policy: str) -> bool:
+    def _keeps(self, motion: PlanResult, policy: str) -> bool:
         if not motion.solved or policy == STRICT:
             return motion.solved
         return motion.confidence is not None and motion.confidence >= self.settings.confidence
 
     def _may_go(self, motion: PlanResult, policy: str) -> bool:
-        return self._good(motion, policy) and not self._goal_seen.missing(motion)
+        return self._keeps(motion, policy) and not self._goal_seen.missing(motion)
 
     def _go(self, motion: PlanResult, policy: str) -> Step:
         stated = motion.confidence if policy == PROBABILISTIC else None
@@ -403,7 +404,7 @@ class Explorer:
                 else:
                     look = replace(problem, goal=JointGoal(waypoints[-1:]))
                     motion = self._probabilistic(look, predicted, self.settings.time_limit, to_goal=False)
-                if motion is not None and self._good(motion, policy):
+                if motion is not None and self._keeps(motion, policy):
                     return motion
         return None
 

@@ -167,7 +167,8 @@ class GoalSeen:
             self._unseen = {q: self._not_shown(balls, [view]) for q, balls in self._unseen.items()}
 
     def best(self, start: Configuration, goals: Configurations) -> Configuration:
-        """The goal at which the smallest part of the arm's surface is unseen."""
+        """The goal at which the smallest part of the arm's surface is unseen. Other configurations than these
+        goals are forgotten."""
         best_goal = min(goals, key=lambda q: len(self.unseen(start, q)))
         goal_keys = set(map(_key, goals))
         self._unseen = {q: balls for q, balls in self._unseen.items() if q in goal_keys}

@@ -88,7 +88,7 @@ class ExplorerSettings(Settings, name="explorer"):
     policy strict. This takes more views, and fails if an obstacle is nearer than about 1 cm to the arm at the
     goal."""
     max_age: Positive | None = None
-    """Observations older than this are forgotten [s]; None: never."""
+    """Observations that are older than the latest view by more than this are forgotten [s]; None: never."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,7 +1,7 @@
 """Search under path constraints: RRT-Connect with projected nodes, and simplification, in the anytime loop.
 
-D. Berenson, S. Srinivasa and J. Kuffner, "Task Space Regions: A framework for pose-constrained
-manipulation planning", IJRR 2011 (CBiRRT2), for trees with projected steps. Edges are proved, not sampled. A
+The trees with projected steps are those of CBiRRT2: D. Berenson, S. Srinivasa and J. Kuffner, "Task Space
+Regions: A framework for pose-constrained manipulation planning", IJRR 2011. Edges are proved, not sampled. A
 straight piece is accepted if the constraints are proved to hold along it. Otherwise its middle is projected
 onto the constraints, and both halves are handled in the same way.
 
