@@ -44,8 +44,8 @@ ShareBelowOne = Annotated[float, Bound(least=0.0, below=1.0)]
 
 
 def one_length(given: dict[str, Any]) -> dict[str, Any]:
-    """The given settings. If `minutes` is given, `samples` becomes None; if only `samples` is given, `minutes`
-    becomes None, since it may have a default."""
+    """The given settings. If `minutes` is given, `samples` becomes None; if only `samples` is given,
+    `minutes` becomes None. Otherwise, the default of the other setting would hold."""
     if given.get("minutes") is not None:
         return given | {"samples": None}
     return given if given.get("samples") is None else given | {"minutes": None}
