@@ -131,4 +131,4 @@ def contacts_on_meshes(
     with nullcontext(oracle) if oracle else PyBulletOracle(robot, scene) as bullet:
         if oracle:
             bullet.set_scene(scene)
-        return MeshContacts(coal, bullet.check_frames(q, tolerance) is not None)
+        return MeshContacts(coal, bullet.check_rows(q, tolerance) is not None)

@@ -105,7 +105,7 @@ def check(
     moves: whether the arm moves at this time.
     """
     oracle.set_scene(rd.Scene([FLOOR, *(ball.at(at) for ball in balls)]))
-    if oracle.check_frames(q[None]) is not None:
+    if oracle.check_rows(q[None]) is not None:
         run.contact_moving = run.contact_moving or moves
         run.contact_resting = run.contact_resting or not moves
 

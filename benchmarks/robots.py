@@ -73,7 +73,7 @@ def check(problem: Problem, result: PlanResult, oracle: PyBulletOracle, tally: T
     tally.configurations += len(q)
     tally.by_coal += bool(ExactCollision(problem.robot, problem.scene).collides(q).any())
     oracle.set_scene(problem.scene)
-    tally.by_pybullet += oracle.check_frames(q, tolerance=0.0) is not None
+    tally.by_pybullet += oracle.check_rows(q, tolerance=0.0) is not None
 
 
 def draw(family: str, robot: Robot, count: int) -> list[tuple[str, Problem]]:

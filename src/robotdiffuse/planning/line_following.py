@@ -121,7 +121,8 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
         elif end is None or np.abs(rows[-1] - end).max() < SAME:
             candidates.append((cost(rows), rows))
         else:
-            why = why or "there the arm has another configuration than the goal"
+            fraction = 1.0
+            why = "there the arm has another configuration than the goal"
         return fraction_followed == 1.0
 
     if isinstance(problem.goal, JointGoal):

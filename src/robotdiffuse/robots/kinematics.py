@@ -82,8 +82,8 @@ def placed_spheres(robot: KinematicTree, q: Configuration) -> Spheres:
 def reach(robot: KinematicTree) -> float:
     """Distance between tip and shoulder that 99 % of the configurations do not exceed [m].
 
-    The shoulder is the point on the first joint's axis at the height of the second joint. With several arms,
-    the largest reach of an arm is returned.
+    The shoulder is the point on the first joint's axis at the height of the second joint, or of the first if
+    it is the only one. With several arms, the largest reach of an arm is returned.
     """
     q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (REACH_SAMPLES, robot.dof))
     reached = []
@@ -92,6 +92,7 @@ def reach(robot: KinematicTree) -> float:
         if not first:  # all joints of this arm are locked
             continue
         offsets = robot.frame_offsets[first]
-        shoulder = np.array([*offsets[0, :2, 3], (offsets[0] @ offsets[-1])[2, 3]])
+        second = offsets[0] @ offsets[1] if len(first) > 1 else offsets[0]
+        shoulder = np.array([*offsets[0, :2, 3], second[2, 3]])
         reached.append(np.linalg.norm(link_origins(robot, q, tip) - shoulder, axis=1))
     return float(np.quantile(reached, REACH_QUANTILE, axis=1).max())
