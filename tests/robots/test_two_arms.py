@@ -190,9 +190,9 @@ def test_both_arms_reach_as_far_as_one() -> None:
         assert reach(robot) < far < reach_bound(robot)
         center, radius = reach_ball(robot)
         assert (np.linalg.norm(spheres[:, :3] - center, axis=1) + spheres[:, 3]).max() < radius
+        assert radius <= reach_bound(robot)
 
 
 def test_the_shoulder_of_one_joint_is_the_joint(tmp_path: Path) -> None:
     """Regression: its height counted twice."""
     assert reach(read_urdf(written(tmp_path, chain("base", ["hinge"])))) == pytest.approx(0.0, abs=1e-9)
-        assert radius <= reach_bound(robot)

@@ -103,8 +103,8 @@ class CaseFile:
         for number, row in enumerate(self._lines.rows, start=1):
             if row.keys() != ROW_FIELDS:
                 raise InputError(
-                    f"{file}, line {number} has {', '.join(row)} instead of {', '.join(sorted(ROW_FIELDS))}; remove "
-                    "the file to generate its problems again"
+                    f"{file}, line {number} has {', '.join(row)} instead of {', '.join(sorted(ROW_FIELDS))}; "
+                    "remove the file to generate its problems again"
                 )
             self._rows[row["name"]] = row  # a later line on the same problem adds the search's result
 
