@@ -227,7 +227,11 @@ PACKED = PCD.format(n=10**9, data="binary_compressed").encode() + struct.pack("<
         ("cloud.pcd", PCD.replace("S {n}", "S -1").format(n=1, data="binary").encode(), "has -1 POINTS; it must be"),
         ("cloud.pcd", PCD.replace("TH {n}", "TH 9").format(n=1, data="binary").encode(), "must be WIDTH x HEIGHT, 9 x 1"),
         ("cloud.pcd", b"FIELDS x y z\nDATA ascii\n1 2 3\n", "is damaged: KeyError: 'POINTS'"),
-        ("cloud.ply", ply(POINTS, False).rpartition(b"\n" + text(POINTS[-1:], " "))[0], "holds 49 of its 50"),
+        (
+            "cloud.ply",
+            ply(POINTS, False).rpartition(b"\n" + text(POINTS[-1:], " "))[0],
+            "states 50 vertices, faces and other elements, but it holds 49",
+        ),
         ("cloud.csv", b"t,x,y\n0,1,2\n", "has the columns .'t', 'x', 'y'.; it must have x, y and z"),
         ("cloud.npy", npy(POINTS + 1j), "holds complex128 of 50 x 3; it must be numbers"),
         ("cloud.npy", npy(POINTS > 0), "holds bool of 50 x 3; it must be numbers"),

@@ -467,7 +467,7 @@ class Problem(Value):
             q: A configuration [dof], or several [n, dof].
 
         Returns:
-            The bound [m], one for each row: the arm is free of collision if it is positive. It is capped at
+            The bound [m], one for each row. If it is positive, the arm is free of collision. It is capped at
             1 m, or at 0.3 m in scenes with point clouds or meshes.
 
         Raises:

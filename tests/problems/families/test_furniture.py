@@ -91,5 +91,5 @@ def test_wrong_settings() -> None:
 @every_family
 def test_impossible_settings(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(furniture, "MAX_TRIES", 5)
-    with pytest.raises(InputError, match=r"none of 5 scenes of .*; change distance or reach"):
+    with pytest.raises(InputError, match=r"each of 5 scenes of .*; change distance, reach or objects"):
         replace(FURNITURE[name], reach=0.01).furnish(np.random.default_rng(6), BASE)

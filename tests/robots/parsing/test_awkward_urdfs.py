@@ -78,7 +78,7 @@ def test_an_arm_that_is_never_free_is_refused_with_the_pair_to_allow(tmp_path: P
     pair = ("column", "bellows2_link")
     how = {"base": "base", "tip": "j3_link", "out": tmp_path / "robot", "settings": QUICK}
     with coarse_grids():
-        text = refuses("configuration collides with itself", add_robot, on_a_lift(tmp_path), **how)
+        text = refuses("the arm collides with itself in every configuration", add_robot, on_a_lift(tmp_path), **how)
     assert f"{pair[0]} and {pair[1]} collide in 100.0%" in text and "--srdf FILE" in text
     assert f"--allow {pair[0]} {pair[1]}" in text and text.count("--allow") == 1
     assert not (tmp_path / "robot").exists()
