@@ -81,8 +81,8 @@ def write_dataset(
         paths: Joint values of each motion [n, dof], in the order of the robot's planned joints [rad] or [m];
             or paths and trajectories, whose positions are taken. They are resampled evenly in joint space.
         scenes: The scene of each motion, of spheres and boxes; or one scene for all motions. If all scenes
-            begin with the same box, not rotated and named "floor", the arm stands on it, and it is not an
-            obstacle.
+            begin with the same box, not rotated and named "floor", it counts as the floor, which
+            networks do not see.
         folder: A folder without data; it is made if it does not exist.
         robot: A robot, or an argument of `load_robot`.
         waypoints: Number of waypoints of a stored motion.
@@ -226,8 +226,8 @@ def export_npz(folder: str | FilePath, file: str | FilePath) -> tuple[int, int]:
 
     Returns the number of written motions and the number of motions that were left out.
 
-    Raises InputError if there is no data set, if it has no such scene or other numbers of waypoints or
-    joints, and if the file cannot be written.
+    Raises InputError if there is no data set, if it has no such scene or not 254 waypoints of 7 joints, and
+    if the file cannot be written.
     """
     file = check_output(file, (".npz",))
     manifest = read_manifest(folder)
@@ -267,7 +267,7 @@ def import_npz(
 ) -> int:
     """Make a data set from a robot.npz in an empty folder; returns the number of its motions.
 
-    Scenes are two spheres of this radius [m] on ROP's floor. Motions are not validated here; `robotdiffuse
+    Scenes are ROP's floor and two spheres of this radius [m]. Motions are not validated here; `robotdiffuse
     data check` validates them. Clearances, lengths and whether the straight line is free are measured. The
     target is the pose of the robot's tip at the last waypoint; the file's targets are not used, since the
     authors' arm has no hand. The safety distance is unknown and set to 0. `progress` is called with the

@@ -96,12 +96,13 @@ def restarted(
     """Call a planner again with new seeds until less time is left than its shortest call took.
 
     Returns the number of further calls and the result with the shortest path. Its `progress` has the times at
-    which shorter paths were found, over all calls. Stops early if no shorter path can exist. The final timing
-    of each call's path is not counted.
+    which shorter paths were found, over all calls. Stops early if no shorter path can exist.
+    Time-parametrizing each call's path is not counted.
     """
     straight = 0.0
     if isinstance(problem.goal, JointGoal):
-        straight = float(np.linalg.norm(problem.goal.positions - problem.start, axis=1).min())
+        goals = problem.robot.nearest_turns(problem.goal.positions, problem.start)
+        straight = float(np.linalg.norm(goals - problem.start, axis=1).min())
     best = first
     spent = first.planning_time
     shortest_call = spent

@@ -127,7 +127,7 @@ class CompletionNetwork(SavedModule):
         return torch.sigmoid(logits).masked_fill_(free, 0.0)
 
     def exports(self) -> dict[str, bytes]:
-        """`probabilities` of one volume."""
+        """The bytes of the ONNX file of `probabilities`, for one volume."""
         # two tensors, because the exporter would take one shared tensor for one input
         inputs = {name: torch.zeros(SHAPE, dtype=torch.uint8) for name in ("seen", "behind")}
         return {".onnx": exported(self, self._probabilities_of_one, inputs, {})}

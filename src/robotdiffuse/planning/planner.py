@@ -43,8 +43,8 @@ class Planner(ABC, Generic[PlannerSettings]):
     request may contain, for every planner."""
 
     follows_lines: ClassVar[bool] = False
-    """If a constraint of the problem is a `CartesianLine`: whether `line_following.py` is tried before
-    `solve`."""
+    """Whether `line_following.py` is tried before `solve` if a constraint of the problem is a
+    `CartesianLine`."""
 
     def __init__(self, settings: PlannerSettings | None = None) -> None:
         """Keep the settings; `prepare` loads weights.
@@ -126,16 +126,16 @@ class Planner(ABC, Generic[PlannerSettings]):
         goal = problem.goal
         load_coal(robot)
         results = [call(Problem(robot, Scene(), start, goal), EASY_TIME_LIMIT)]
-        # a ball on the straight line forces a path with corners; separate compiled code times such paths
+        # a ball on the straight line forces a path with corners, which needs more compiled code
         ends = [] if results[0].path is None else [results[0].path.positions[-1]]
         on_line = [start + share * (end - start) for end in ends for share in (0.5, 0.35)]
         for q in on_line:
             ball = Sphere(link_pose(robot, q, robot.tip)[:3, 3], WARM_UP_RADIUS)
             results.append(call(Problem(robot, Scene([ball]), start, goal), EASY_TIME_LIMIT))
-        kinds = replace(problem, waypoints=(), blend=(), moving=(), start_velocity=None)
+        last = replace(problem, waypoints=(), blend=(), moving=(), start_velocity=None)
         if not problem.views:
-            kinds = replace(kinds, scene=one_of_each(problem.scene))
-        return [*results, call(kinds, SHORT_TIME_LIMIT)]
+            last = replace(last, scene=one_of_each(problem.scene))
+        return [*results, call(last, SHORT_TIME_LIMIT)]
 
     def attempt(self, problem: Problem, request: PlanRequest) -> PlanResult:
         """Plan from the problem's start to its goal by one call of `solve`.
@@ -235,7 +235,8 @@ class CheckedSettings(Settings):
 
 def ever_finer(context: PlanningContext, settings: PlannerSettings) -> Iterator[tuple[PlannerSettings, int]]:
     """Yields settings and the number of the attempt, from 0, until time runs out. Each attempt has a finer
-    resolution of collision checks, for searches whose last path the validator refused."""
+    resolution of collision checks, down to FINEST_RESOLUTION, for searches whose last path the validator
+    refused."""
     attempt = 0
     while attempt == 0 or context.remaining > 0:
         yield settings, attempt

@@ -135,7 +135,7 @@ def _lines(text: str) -> list[tuple[int, str]]:
 def problem_record(
     problem: Problem, folder: str | Path | None = None, robot: str | None = None
 ) -> dict[str, object]:
-    """Convert a problem to JSON values. Numbers are kept exactly.
+    """Convert a problem to JSON values. Numbers are kept exactly, but transformed poses have 12 decimals.
 
     Args:
         problem: The problem.
@@ -267,7 +267,7 @@ def _requested(
             continue
         start_value = request.start.get(joint.name, locked)
         if abs(locked - start_value) > MIMIC_SLACK:
-            implied = f"it mimics {joint.mimic.joint}: planned at {locked:g}"
+            implied = f"it mimics {joint.mimic.joint}: held at {locked:g}"
             notes.append(f"start_state: {joint.name} is {start_value:g}, but {implied}")
 
     start = robot.planned_values("start_state", request.start)
@@ -349,7 +349,7 @@ def _robot(name: object, locked: object, folder: Path, robots: Mapping[str, Robo
         check_name("robot", name, robots)
     if not isinstance(name, str) or not name:
         raise InputError(
-            f"robot is {shown(name)}; it must be a bundled name ({', '.join(ROBOTS)}) or a URDF file"
+            f"robot is {shown(name)}; it must be a name ({', '.join(ROBOTS)}, or added) or a robot's file"
         )
     if name not in ROBOTS and (name.endswith(FILE_ENDINGS) or "/" in name):
         name = str((folder / name).absolute())

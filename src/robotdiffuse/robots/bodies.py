@@ -65,7 +65,7 @@ class AttachedBody(Value):
     tool: bool = False
     """Whether the body is a tool, which may become the tip."""
 
-    # bodies of equal content are equal, as keys of caches
+    # equal by content, since bodies are keys of caches
 
     def __hash__(self) -> int:
         return hash(_content(self))

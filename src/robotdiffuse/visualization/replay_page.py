@@ -74,7 +74,7 @@ MAX_ROWS = 3000
 VIEW_SIZE = (1600, 1000)
 """Window size for which the first view is chosen [pixels]."""
 VIEW_MARGINS = (0.09, 0.15)
-"""Fractions of the window's height that the first view leaves free for the panels."""
+"""Fractions of the window's height left free for the panels above and below by the first view."""
 
 
 def write_replay(
@@ -281,8 +281,8 @@ def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | N
     The arm is drawn at the start and at the goal; in pictures the arm at the start is see-through, on pages
     the arm at the goal. Colliding links are red, and goal poses are drawn as axes. Of several goals, the
     first free one is drawn; if none is free, the first one. Moving obstacles are drawn at their first pose.
-    `result` gives the reason why there is no motion. Raises InputError for a file name with another ending,
-    or a file that cannot be written.
+    `result` gives the reason why there is no motion, shown if start and goal are free. Raises InputError for
+    a file name with another ending, or a file that cannot be written.
     """
     target = check_output(file, (".html", ".htm", ".png"))
     goal_configuration, validity = _goal_state(problem)

@@ -273,7 +273,7 @@ def test_names_by_which_an_added_robot_could_not_be_loaded_are_refused(name: str
     ("how", "message"),
     [
         ({"allow": [("base", "base")]}, "allow names link base twice"),
-        ({"srdf": "arm.urdf"}, "is not an SRDF, a <robot> without <link>"),
+        ({"srdf": "arm.urdf"}, "its root <robot> must be a <robot> without <link>"),
         ({"srdf": "other.srdf"}, "is for another robot: it names no link"),
     ],
 )

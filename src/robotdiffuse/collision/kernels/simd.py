@@ -35,7 +35,7 @@ _INTEGERS = ir.VectorType(ir.IntType(32), W)
 _FIRST_TO_ALL = ir.Constant(_INTEGERS, [0] * W)
 # Alignment that loads, stores and gathers rely on [bytes]: that of one float32
 _ALIGN = 4
-# typed Any because callers do not pass the first argument, the context
+# Any, since callers of intrinsics omit the first argument, the context
 _operation: Any = intrinsic
 
 
@@ -230,7 +230,7 @@ def lane(_context: Any, a: Any, i: Any) -> Any:
 
 @_operation
 def lanes_with_bit(_context: Any, a: Any, bit: Any) -> Any:
-    """Mask of the lanes whose value, an integer, has a bit in common with `bit`."""
+    """Mask of the lanes for which (the integer value & `bit`) is not 0."""
 
     def codegen(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
         numbers = builder.fptosi(args[0], _INTEGERS)

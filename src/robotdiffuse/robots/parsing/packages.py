@@ -26,7 +26,7 @@ class Packages(NamedTuple):
     """Finds the ROS packages of a URDF.
 
     The folder of a package is searched in `folders`, then in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, then
-    from the URDF's folder upwards: first a folder with the package's name, then a folder that contains one.
+    from the URDF's folder upwards: first folders with the package's name, then subfolders with that name.
     Files that the package's folder lacks are searched relative to the URDF's folder and all folders above it,
     with and without the package's name.
     """

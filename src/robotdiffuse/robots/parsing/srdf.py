@@ -114,7 +114,7 @@ def read_srdf(file: str | Path) -> Srdf:
     path = Path(file)
     root = parse_xml(read_bytes(path, "SRDF"), str(path))
     if root.tag != "robot" or root.find("link") is not None:
-        raise InputError(f"{path} is not an SRDF, a <robot> without <link>; its root is <{root.tag}>")
+        raise InputError(f"{path} is not an SRDF: its root <{root.tag}> must be a <robot> without <link>")
 
     def text(element: ET.Element, what: str) -> str:
         value = element.get(what)
@@ -168,16 +168,16 @@ GRIPPER = re.compile("grip|finger|jaw|claw|knuckle|thumb", re.IGNORECASE)
 BOTH = "both"
 """Name of the group of all arms of a robot with two arms."""
 ALL = "all"
-"""Name of the group of all arms, for any number of arms."""
+"""Name of the group of all arms, for any number of arms from two on."""
 SUFFIX_CHARACTERS = "_-/0123456789 "
 """Characters stripped from the end of the common prefix of an arm's joint names."""
 MAX_FINGER_JOINTS = 2
-"""Largest number of movable joints per finger of a gripper with two fingers."""
+"""Largest number of independent joints per finger of a gripper with two fingers."""
 MAX_HAND_FINGER_JOINTS = 3
-"""Largest number of movable joints per finger of a gripper with another number of fingers."""
+"""Largest number of independent joints per finger of a gripper with another number of fingers."""
 MIN_ARM_JOINTS = 4
-"""Smallest number of own joints of an arm (see `Arm.own_joints`) if there are several chains. After this many
-own joints, three or more branches form a hand, with any number of joints per finger."""
+"""Chains with fewer own joints (see `Arm.own_joints`) count as arms only if no chain has as many. After this
+many own joints, three or more branches form a hand, with any number of joints per finger."""
 
 
 class Arm(NamedTuple):
@@ -207,7 +207,7 @@ class JointTree:
         self.below: dict[str, list[Joint]] = {}
         self.moving: dict[str, int] = {}
         """Largest number of independent movable joints in a chain below each link."""
-        self.moved: set[str] = set()
+        self.roots: set[str] = set()
         """Links with a movable joint below them, mimic joints included."""
         self._depth: dict[str, int] = {}
         """Number of joints in the longest chain below each link."""
@@ -217,8 +217,8 @@ class JointTree:
             self.moving[joint.parent] = max(self.moving.get(joint.parent, 0), self._chain_length(joint))
             below = self._depth.get(joint.child, 0) + 1
             self._depth[joint.parent] = max(self._depth.get(joint.parent, 0), below)
-            if joint.kind in MOVING_KINDS or joint.child in self.moved:
-                self.moved.add(joint.parent)
+            if joint.kind in MOVING_KINDS or joint.child in self.roots:
+                self.roots.add(joint.parent)
 
     def _chain_length(self, joint: Joint) -> int:
         """Largest number of independent movable joints in a chain that begins with a joint."""
@@ -238,7 +238,7 @@ class JointTree:
         after the last branching."""
         while True:
             next_joints = [
-                j for j in self.below.get(link, []) if j.kind in MOVING_KINDS or j.child in self.moved
+                j for j in self.below.get(link, []) if j.kind in MOVING_KINDS or j.child in self.roots
             ]
             if chain and self._begins_gripper(next_joints, own_joints):
                 return [Arm(chain, link, own_joints)]
@@ -255,8 +255,8 @@ class JointTree:
         return ((*chain, joint.name), own_joints + 1) if joint.kind in MOVING_KINDS else (chain, own_joints)
 
     def _begins_gripper(self, branches: list[Joint], own_joints: int) -> bool:
-        """Whether a gripper or a hand begins where these joints branch off, `own_joints` joints after the
-        last branching."""
+        """Whether `branches` begin a gripper or a hand; `own_joints` joints precede them since the last
+        branching."""
         lengths = [self._chain_length(joint) for joint in branches]
         if len(branches) == 1:
             jaw = branches[0].kind in MOVING_KINDS and GRIPPER.search(branches[0].name)
@@ -310,7 +310,7 @@ def planned_joints(
 
 def _ends(chosen: list[str], above: dict[str, Joint], written: list[str]) -> list[str]:
     """Tips of a group with the joints `chosen`: the child links of its last joints. A tip that the SRDF gives
-    (`written`) replaces the last of these child links that lies on the way to the tip."""
+    (`written`) replaces the one of these child links that leads to it."""
     last = {joint.child: joint.child for joint in above.values() if joint.name in chosen}
     for link in [*last]:
         for joint in chain(above, link)[:-1]:
