@@ -155,12 +155,12 @@ class KinematicTree(Value):
         return (self.tip, *self.other_tips)
 
     @cached_property
-    def _above(self) -> dict[str, Joint]:
+    def _parent_joints(self) -> dict[str, Joint]:
         return {joint.child: joint for joint in self.joints}
 
     def joints_above(self, link: str) -> list[Joint]:
         """The joints from the base to a link."""
-        return chain(self._above, link)
+        return chain(self._parent_joints, link)
 
     @cached_property
     def planned_joints(self) -> tuple[Joint, ...]:

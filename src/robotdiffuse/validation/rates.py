@@ -9,9 +9,9 @@ rest before the first row (or to move at the problem's start velocity) and after
 Rates agree with the positions if some motion within the limits has these rates and positions. If a joint's
 velocity changes from v0 to v1 in a step of h seconds with accelerations up to A, it moves by h (v0 + v1) / 2
 ± (A h² - (v1 - v0)² / A) / 4. The extremes are full acceleration followed by full braking, and the reverse. A
-is twice the greatest acceleration in the motion, by rows, positions or velocities, but at most the limit with
-its tolerance. The
-acceleration of a row must be near those of the cubics before and after the row.
+is twice the greatest acceleration measured by rows, positions or velocities, but at most the limit with its
+tolerance. The acceleration of a row must be in or near the interval between those that the cubics before and
+after it have there.
 
 Positions have a limited resolution, which hides any velocity over a step of nanoseconds. If rows are closer
 than a millisecond, the tests are therefore repeated between rows that are further apart.
@@ -127,9 +127,9 @@ def _checks(
     yield limited("velocity", rate_name, cubics.extremes.velocity, 1.5 * mean_error)
     yield limited("velocity", "velocity", v)
 
-    # Second differences of positions. A step as long as its neighbor is added at each end. Its mean velocity
-    # is
-    # such that the two average to `initial_velocity` (before the first row) or 0 (after the last).
+    # Second differences of positions. A step as long as its neighbor is added at each end. The mean
+    # velocities
+    # of both steps average to `initial_velocity` (before the first row) or 0 (after the last).
     means = _padded(2 * initial_velocity - mean[:1], mean, -mean[-1:])
     durations = _padded(step[:1], step, step[-1:])
     uncertainty = _padded(mean_error[:1], mean_error, mean_error[-1:])
@@ -185,26 +185,26 @@ def _checks(
 
     if step.min(initial=np.inf) >= AVERAGING_WINDOWS[0]:
         return
-    # tests over longer times: to each row from the earlier row with the largest excess
+    # tests over longer times: to each row from the one that `_worst_earlier_row` gives
     times = trajectory.times
     resolution = settings.limit_slack
     rate_name = "mean velocity from an earlier row to here"
     farthest = (times - times[0])[:, None] * limit_factor * robot.velocity
-    first, span = _worst_earlier_row(times, q, farthest)
-    moved = _change_since(q, first) / span
+    since, span = _worst_earlier_row(times, q, farthest)
+    moved = _change_since(q, since) / span
     yield limited("velocity", rate_name, moved, 2 * resolution / span)
 
     stated_positions = _cumulative(step * (v[1:] + v[:-1]) / 2)
     allowed = _cumulative(step * possible)
-    first, span = _worst_earlier_row(times, q - stated_positions, allowed)
-    moved = _change_since(q, first) / span
-    stated = _change_since(stated_positions, first) / span
+    since, span = _worst_earlier_row(times, q - stated_positions, allowed)
+    moved = _change_since(q, since) / span
+    stated = _change_since(stated_positions, since) / span
     yield _Check(
         "rates",
         rate_name,
         moved,
         np.abs(moved - stated),
-        (_change_since(allowed, first) + 2 * resolution) / span,
+        (_change_since(allowed, since) + 2 * resolution) / span,
         lambda i, j: f"but its velocities give {stated[i, j]:.6g}",
     )
 
@@ -231,22 +231,22 @@ def _worst_earlier_row(
     """
     rows = np.arange(len(values))[:, None]
     beyond = np.full(values.shape, -np.inf)
-    first = np.broadcast_to(rows, values.shape)
+    since = np.broadcast_to(rows, values.shape)
     for signed in (values, -values):
         excess = signed - allowed
         min_excess = np.minimum.accumulate(excess, axis=0)
         at = np.maximum.accumulate(np.where(excess <= min_excess, rows, 0), axis=0)
         # shifted by one row to exclude the row itself
         min_excess = _padded(excess[:1], min_excess[:-1])
-        at = _padded(first[:1], at[:-1])
-        first = np.where(excess - min_excess > beyond, at, first)
+        at = _padded(since[:1], at[:-1])
+        since = np.where(excess - min_excess > beyond, at, since)
         beyond = np.maximum(beyond, excess - min_excess)
-    return first, np.maximum(times[:, None] - times[first], MIN_TIME)
+    return since, np.maximum(times[:, None] - times[since], MIN_TIME)
 
 
-def _change_since(rows: JointRows, first: Int[ndarray, "n dof"]) -> JointRows:
-    """The change of each joint's value since its earlier row `first`."""
-    return rows - np.take_along_axis(rows, first, axis=0)
+def _change_since(rows: JointRows, since: Int[ndarray, "n dof"]) -> JointRows:
+    """The change of each joint's value since its earlier row `since`."""
+    return rows - np.take_along_axis(rows, since, axis=0)
 
 
 def _second_differences(

@@ -52,7 +52,7 @@ class Processes:
     methods in the same order."""
 
     def __init__(self, device: str | None) -> None:
-        """device: cpu, or cuda with a device for every process; None: cuda if there is one.
+        """device: cpu, or cuda, each process on its own device; None: cuda if present.
 
         Matrices are multiplied in bf16 on devices that do so fast. Raises InputError if Accelerate is not
         installed, the device is missing, or this process has trained on another device.
@@ -269,7 +269,7 @@ class TrainingRun:
                     self.step()
                     now = time.monotonic()
                     due = now - saved > self.settings.checkpoint_seconds
-                    # means: not 0 in all processes if one of them got a signal, or is due
+                    # means: above 0 in all processes if any one got a signal or is due
                     elapsed, stopped, due = self.processes.mean(now - last, stop.is_set(), due)
                     self.at.seconds += elapsed
                     rate = self._samples_per_step / max(elapsed, 1e-9)

@@ -88,10 +88,10 @@ def plan_with_unknown_space(
     """A motion under the problem's policy for unknown space; see the docstring of the module.
 
     predicted: the probability that each fine voxel of the observed volume is occupied; None: the occupancy
-    completion network predicts it if the policy needs it.
-    unknown: the space that no view saw; None: computed from the problem's views. A caller
-    that has put the observed points into the scene, as `Explorer` does, may give it under the policies padded
-    and predicted; then no volume is computed from the views.
+    completion network predicts it if the policy needs it. unknown: the space that no view saw; None: computed
+    from the problem's views. A caller that has put the observed points into the scene, as `Explorer` does,
+    may give it under the policy padded, or under predicted with `predicted`; then no volume is computed from
+    the views.
 
     The result states the assumption, the confidence (the probability that the motion is free in the true
     scene), and the unknown space that the motion crosses.
@@ -262,8 +262,9 @@ class _Attempts:
     """Upper limit of the confidence, lowered if a camera seems misplaced: its images may then show occupied
     space as free."""
 
-    def best(self, problem: Problem, assumption: str, until: float) -> PlanResult:
-        """A motion found before `until` [s since the call], or the result that says why there is none.
+    def best(self, problem: Problem, assumption: str, end: float) -> PlanResult:
+        """A motion found before `end` [s since the call] or in the minimum time, or the result that says why
+        there is none.
 
         With predicted probabilities, several first motions are planned, and then one that is improved for the
         remaining time. Among those with about the highest confidence, the shortest is returned.
@@ -273,7 +274,7 @@ class _Attempts:
         motions = list[PlanResult]()
         while len(motions) < MAX_FIRST_MOTIONS:
             quick = replace(request, until=FIRST, seed=request.seed + len(motions)) if predicted else request
-            result = self._attempt(problem, assumption, until, quick)
+            result = self._attempt(problem, assumption, end, quick)
             if not result.solved and not motions:
                 return result
             if not result.solved:
@@ -281,10 +282,10 @@ class _Attempts:
             motions.append(result)
             lowest_risk = min(motion.swept_probability or 0.0 for motion in motions)
             acceptable = ACCEPTABLE_RISK if len(motions) >= MIN_FIRST_MOTIONS else NEGLIGIBLE_RISK
-            if self.context.elapsed >= until or lowest_risk <= acceptable:
+            if self.context.elapsed >= end or lowest_risk <= acceptable:
                 break
-        if predicted and request.until != FIRST and self.context.elapsed < until:
-            result = self._attempt(problem, assumption, until, request)
+        if predicted and request.until != FIRST and self.context.elapsed < end:
+            result = self._attempt(problem, assumption, end, request)
             motions += [result] if result.solved else []
         min_confidence = max(motion.confidence or 0.0 for motion in motions) - CONFIDENCE_TOLERANCE
         best = [motion for motion in motions if (motion.confidence or 0.0) >= min_confidence]
@@ -292,11 +293,11 @@ class _Attempts:
         region = self.unknown.crossed(chosen.path).region
         return replace(chosen, planning_time=self.context.elapsed, unknown_region=region)
 
-    def _attempt(self, problem: Problem, assumption: str, until: float, request: PlanRequest) -> PlanResult:
-        """The planner's result; a motion with the confidence under the assumption."""
+    def _attempt(self, problem: Problem, assumption: str, end: float, request: PlanRequest) -> PlanResult:
+        """The planner's result; if solved, with its confidence and assumption."""
         context_request = self.context.request
         began = self.context.elapsed
-        limit = max(until - began, MIN_TIME_FRACTION * context_request.time_limit)
+        limit = max(end - began, MIN_TIME_FRACTION * context_request.time_limit)
         result = self.planner.attempt(problem, replace(request, time_limit=limit))
         progress = tuple((began + at, length) for at, length in result.progress)
         result = replace(

@@ -23,8 +23,8 @@ from robotdiffuse.robots.fitting.sphere_fitting_kernel import deepest_touches
 from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, Joint
 from robotdiffuse.robots.robot import Robot, moving_pairs
 
-ADJACENT_STRIDE = 10
-"""Adjacent links, which may touch in any case, are tested in only 1 / ADJACENT_STRIDE of the samples."""
+ADJACENT_SHARE = 0.1
+"""Adjacent links, which may touch in any case, are tested in only this fraction of the samples."""
 MIN_LIMITS_COLLIDING = 0.2
 """Smallest fraction of colliding samples for the reason `limits`."""
 MAX_LOCKED_JOINTS = 1
@@ -47,10 +47,10 @@ class SamplingSettings:
     """Number of configurations, uniform within the limits of all joints, including gripper joints."""
     descents: int = 20
     """For a pair without collisions in the samples: number of closest samples from which a descent searches
-    for a collision."""
+    for a collision; a fifth of it if no sample is close."""
     assumptions: bool = True
     """Whether pairs may be allowed for the reasons `adjacent`, `default`, `pose` and `limits`. False for
-    MuJoCo models, which define themselves which links may touch."""
+    MuJoCo models, which state which links may touch."""
 
 
 class PairReport(NamedTuple):
@@ -124,9 +124,9 @@ def find_allowed_collisions(
         return "checked"
 
     reports = []
-    strided = {link: T[: max(len(q) // ADJACENT_STRIDE, 1)] for link, T in poses.items()}
+    first = {link: T[: max(int(len(q) * ADJACENT_SHARE), 1)] for link, T in poses.items()}
     for a, b in moving_pairs(robot, robot.meshes):
-        sphere_distances = links.sphere_distance(strided if frozenset((a, b)) in adjacent else poses, a, b)
+        sphere_distances = links.sphere_distance(first if frozenset((a, b)) in adjacent else poses, a, b)
         colliding = np.zeros(len(sphere_distances), dtype=bool)
         for i in np.flatnonzero(sphere_distances <= 0):
             colliding[i] = links.collide(poses, a, b, int(i))
@@ -135,7 +135,7 @@ def find_allowed_collisions(
 
 
 def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng: np.random.Generator) -> bool:
-    """Whether random descents on the distance between the meshes find a collision of two links."""
+    """Whether random descents on the distance of the convex parts find a collision of two links."""
     for start in starts:
         q = start
         step = 0.1 * (links.upper - links.lower)
@@ -196,8 +196,8 @@ MAX_SPHERE_CASES = 2000
 MAX_PART_CASES = 60
 """Largest number of false collisions of convex parts per pair of links that are examined."""
 NARROWEST_FRACTION = 0.003
-"""For each pair, the false collisions of spheres with the narrowest gaps, up to this fraction of the
-configurations, are left out of `PairFalseCollisions.places`: spheres need not become finer there."""
+"""For each pair, the false collisions of spheres where the convex parts are nearest, up to this fraction of
+the configurations, are left out of `PairFalseCollisions.places`: spheres need not become finer there."""
 
 
 class PairFalseCollisions(NamedTuple):

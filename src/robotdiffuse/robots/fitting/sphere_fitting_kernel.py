@@ -12,7 +12,7 @@ import numpy as np
 from robotdiffuse.core.kernels import allocation_free, kernel
 from robotdiffuse.robots.frame_kernel import ball_gap, column, dot, length, minus, placed, rotated_back
 
-# initial step of the search for a center [m]: in the first round, its lower bound, and its factor per round
+# initial step of the search for a center [m]: in round 1; lower bound in later rounds; factor per round
 INITIAL_STEP = 0.004
 MIN_INITIAL_STEP = 0.0005
 STEP_SHRINKAGE = 0.8
@@ -305,6 +305,8 @@ def move_center(center, assigned_points, count, step, grid, origin, spacing, dir
 def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing, directions):
     """Alternate between assigning cells to spheres and moving the spheres.
 
+    sharp: points that are always tested, see `Cells.sharp`.
+
     Returns the best centers found and their largest excess radius. Ends early when the excess is at most
     `enough`.
     """
@@ -330,8 +332,8 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
             best_value = value
         if value <= enough or r == rounds:
             break
-        # `on_rim`: points that the owners of their cells must contain. A point between cells of one owner is
-        # such a point only if it is a vertex of the mesh. `first`: the owner of a point's first cell.
+        # `on_rim`: points to test against the owners of their cells: those that are `sharp` or in cells of
+        # several owners; all others are inside if these are. `first`: the owner of a point's first cell.
         first[:] = -1
         on_rim[:] = sharp
         ends[:] = 0
