@@ -228,6 +228,13 @@ def test_data_of_other_versions_and_robots_are_refused(change, message, folder, 
     refuses(message, generate, SETTINGS, tmp_path)
 
 
+def test_a_locked_folder_that_stays_empty_leaves_no_parents(tmp_path: Path) -> None:
+    """Regression: a refused training left the folders above its own."""
+    with lock_folder(tmp_path / "new" / "out"):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
 def test_unusable_folders_workers_and_clusters_are_refused(folder: Path, tmp_path: Path) -> None:
     refuses("workers is 0", generate, SETTINGS, tmp_path / "data", 0)
     refuses(r"cluster.*slurm.*ray", generate, SETTINGS, tmp_path / "data", cluster="slurm")

@@ -129,14 +129,19 @@ def run_export(arguments: Namespace) -> None:
 
 def _check_folder(out: str) -> None:
     """Raise InputError if the folder cannot be written, before the data are read or generated."""
-    if int(os.environ.get("RANK", "0")) == 0:
+    if _is_first_process():
         with lock_folder(Path(out)):
             pass
 
 
+def _is_first_process() -> bool:
+    """Whether this is the first of the processes that torchrun started, or the only process."""
+    return int(os.environ.get("RANK", "0")) == 0
+
+
 def _print_report(figures: dict[str, float], out: str) -> None:
-    if int(os.environ.get("RANK", "0")) > 0:
-        return  # only the first process of torchrun prints
+    if not _is_first_process():
+        return
     for name, value in figures.items():
         print(f"{name}: {value:.6g}")
     print(f"wrote {out}")

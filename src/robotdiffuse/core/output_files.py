@@ -167,12 +167,12 @@ class JsonLines:
 
 @contextmanager
 def lock_folder(out: Path) -> Iterator[None]:
-    """Make the folder, and lock it during the block. The lock is also released if the process is killed. If
-    the folder was made here and is still empty at the end of the block, it is removed.
+    """Make the folder, and lock it during the block. The lock is also released if the process is killed. At
+    the end of the block, folders that were made here and are still empty are removed.
 
     Raises InputError if another process holds the lock or the folder cannot be made or written into.
     """
-    made = not out.exists()
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
         out.mkdir(parents=True, exist_ok=True)
         TemporaryFile(dir=out).close()
@@ -191,6 +191,6 @@ def lock_folder(out: Path) -> Iterator[None]:
         yield
     finally:
         os.close(folder)
-        if made:
-            with suppress(OSError):  # it is not empty
-                out.rmdir()
+        with suppress(OSError):  # one is not empty
+            for empty in made:
+                empty.rmdir()
