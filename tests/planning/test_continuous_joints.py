@@ -10,7 +10,6 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.refusals import refuses
 from robotdiffuse.interop.recorded_motion import RecordedMotion, motion_of_robot
-from robotdiffuse.planning.start_goal import copies
 from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT
 from robotdiffuse.robots.parsing.urdf import with_limits
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
@@ -71,11 +70,11 @@ def test_values_wrapped_to_half_a_turn_are_no_motion_but_those_of_a_file_are_unw
 
 def test_images_of_a_goal() -> None:
     start = np.array([3.0, 1.0, -0.2])
-    nearest, first, last = copies(ARM, start, np.array([-3.0 - 4 * np.pi, -1.0, 0.2]))
+    nearest, first, last = ARM.turned_both_ways(np.array([-3.0 - 4 * np.pi, -1.0, 0.2]), start, ARM.continuous)
     np.testing.assert_allclose(nearest, [2 * np.pi - 3, -1.0, 0.2])
     np.testing.assert_allclose(first, [-3.0, -1.0, 0.2])
     np.testing.assert_allclose(last, [2 * np.pi - 3, -1.0, 0.2 - 2 * np.pi])
-    assert len(copies(box_arm(), start, start)) == 1
+    assert len(box_arm().turned_both_ways(start, start, box_arm().continuous)) == 1
     assert (np.abs([nearest, first, last]) <= CONTINUOUS_LIMIT).all()
 
 

@@ -101,8 +101,9 @@ def restarted(
     """
     straight = 0.0
     if isinstance(problem.goal, JointGoal):
-        goals = problem.robot.nearest_turns(problem.goal.positions, problem.start)
-        straight = float(np.linalg.norm(goals - problem.start, axis=1).min())
+        differences = problem.goal.positions - problem.start
+        differences -= problem.robot.whole_turns(differences)
+        straight = float(np.linalg.norm(differences, axis=1).min())
     best = first
     spent = first.planning_time
     shortest_call = spent

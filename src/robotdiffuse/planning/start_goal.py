@@ -62,8 +62,9 @@ class StartGoal:
     are free, from which or to which the search plans. The lead of a free configuration is the configuration
     itself.
 
-    Whole turns are removed from continuous joints of the start; `complete` adds them to the path. Each goal
-    is replaced by its copies, see `copies`; copies without a lead are dropped.
+    Whole turns are removed from continuous joints of the start; `complete` adds them to the path. A search
+    does not wrap angles, so each goal is replaced by copies with whole turns of its continuous joints
+    (`turned_both_ways`); copies without a lead are dropped.
     """
 
     def __init__(
@@ -85,7 +86,9 @@ class StartGoal:
         self.checker = checker
         self._turns = robot.whole_turns(start)
         self.start = start - self._turns
-        goal_copies = [copy for goal in goals for copy in copies(robot, self.start, goal)]
+        goal_copies = [
+            copy for goal in goals for copy in robot.turned_both_ways(goal, self.start, robot.continuous)
+        ]
         states = [self.start, *goal_copies]
         free = checker.free(np.stack(states))  # one batch, since most are free
         self.start_lead, *leads = (
@@ -177,21 +180,6 @@ def falling_clearances(most: float, checker: CollisionChecker, states: Configura
     return sorted(
         {most * step / CLEARANCE_STEPS for step in range(CLEARANCE_STEPS + 1)} | at_ends, reverse=True
     )
-
-
-def copies(robot: Robot, start: Configuration, goal: Configuration) -> list[Configuration]:
-    """Copies of the goal with whole turns added to continuous joints, since a search does not wrap angles.
-
-    First the copy nearest to the start. Then, for each continuous joint, a copy in which this joint turns the
-    other way, because an obstacle may block the shorter way.
-    """
-    nearest = goal - robot.whole_turns(goal - start)
-    result = [nearest]
-    for j in np.flatnonzero(robot.continuous):
-        copy = nearest.copy()
-        copy[j] -= np.copysign(2 * np.pi, nearest[j] - start[j])
-        result.append(copy)
-    return result
 
 
 def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
@@ -444,8 +432,11 @@ def _pose_goals(
     if not len(rejected):
         # of several poses, name those that cannot be reached even alone, or all
         several = poses_of(goal) if len(place_of) > 1 else ()
-        never = [pose.frame for pose in several if not len(pose_configurations(unconstrained, pose, rng))]
-        unreached = " and ".join(f"{frame} to the pose at {place_of[frame]}" for frame in never or place_of)
+        unreachable = [
+            pose.frame for pose in several if not len(pose_configurations(unconstrained, pose, rng))
+        ]
+        frames = unreachable or place_of
+        unreached = " and ".join(f"{frame} to the pose at {place_of[frame]}" for frame in frames)
         return context.fail(
             Status.UNREACHABLE_GOAL, f"no configuration within the joint limits brings {unreached}"
         )

@@ -226,19 +226,21 @@ class KinematicTree(Value):
         return np.where(self._more_than_a_turn, q - TURN * np.round((q - middle) / TURN), q)
 
     def equivalent_configurations(self, q: Configuration, start: Configuration) -> Configurations:
-        """Configurations within the limits that differ from `q` by whole turns of joints that have limits and
-        a range above one turn.
+        """`turned_both_ways` for the joints that have limits and a range above one turn."""
+        return self.turned_both_ways(q, start, self._more_than_a_turn & ~self.continuous)
+
+    def turned_both_ways(self, q: Configuration, start: Configuration, joints: JointMask) -> Configurations:
+        """Configurations within the limits that differ from `q` by whole turns of the masked joints.
 
         In the first row, each such joint is as close to `start` as possible. In each further row, one such
         joint reaches `q` by turning in the other direction, since obstacles may block the short way.
         """
-        several_turns = self._more_than_a_turn & ~self.continuous
-        nearest = self._turned(q, start, several_turns)
+        nearest = self._turned(q, start, joints)
         rows = [nearest]
-        for j in np.flatnonzero(several_turns):
+        for j in np.flatnonzero(joints):
             other_way = nearest.copy()
             other_way[j] -= np.copysign(TURN, nearest[j] - start[j])
-            if self.lower[j] <= other_way[j] <= self.upper[j]:
+            if self.continuous[j] or self.lower[j] <= other_way[j] <= self.upper[j]:
                 rows.append(other_way)
         return np.stack(rows)
 
