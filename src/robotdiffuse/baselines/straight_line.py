@@ -54,6 +54,6 @@ class StraightLine(Planner[StraightLineSettings]):
         lines = straight_lines(start_goal)
         if self.settings.goals == NEAREST:
             lines = lines[[np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).argmin()]]
-        tried = "line is" if len(lines) == 1 else f"lines to {len(lines)} goal configurations are"
+        subject = "line is" if len(lines) == 1 else f"lines to {len(lines)} goal configurations are"
         result = shortest_accepted(context, start_goal, lines, self.name)
-        return result or context.unsolved(f"the straight {tried} refused")
+        return result or context.unsolved(f"the straight {subject} refused")

@@ -92,11 +92,11 @@ class Table:
         places: set[tuple[int, int]] = set()
         for j, column in enumerate(self.columns):
             values = {i: _value(row[j]) for i, row in enumerate(self.rows)}
-            known = {i: value for i, value in values.items() if value == value}
-            if column.better and known:
-                best = (max if column.better == "more" else min)(known.values())
-                texts = {_text(self.rows[i][j], column) for i, value in known.items() if value == best}
-                winners = [i for i in known if _text(self.rows[i][j], column) in texts]
+            numbers = {i: value for i, value in values.items() if value == value}
+            if column.better and numbers:
+                best = (max if column.better == "more" else min)(numbers.values())
+                texts = {_text(self.rows[i][j], column) for i, value in numbers.items() if value == best}
+                winners = [i for i in numbers if _text(self.rows[i][j], column) in texts]
                 places |= {(i, j) for i in winners if 2 * len(winners) <= len(self.rows)}
         return places
 

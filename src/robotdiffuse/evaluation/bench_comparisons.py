@@ -228,11 +228,11 @@ class Mean(NamedTuple):
     @classmethod
     def of(cls, values: Iterable[float | None]) -> "Mean":
         """The mean of the values, leaving out None and NaN."""
-        known = np.array([value for value in values if value is not None and value == value])
-        if not len(known):
+        numbers = np.array([value for value in values if value is not None and value == value])
+        if not len(numbers):
             return cls(np.nan, np.nan)
-        half = 1.96 * float(known.std(ddof=1)) / len(known) ** 0.5 if len(known) > 1 else np.nan
-        return cls(float(known.mean()), half)
+        half = 1.96 * float(numbers.std(ddof=1)) / len(numbers) ** 0.5 if len(numbers) > 1 else np.nan
+        return cls(float(numbers.mean()), half)
 
     def cell(self, metric: Metric) -> Figure | None:
         """The cell of a table: the mean of a metric with its interval; None without a mean."""

@@ -201,8 +201,8 @@ def check_data(
         total = sum(len(chosen) for _, chosen in parts)
         progress(checked, total)
         results = in_order(processes.each(task.validate, parts))
-        for (_, chosen), (found, clearance) in zip(parts, results, strict=True):
-            findings += found
+        for (_, chosen), (part_findings, clearance) in zip(parts, results, strict=True):
+            findings += part_findings
             least_clearance = min(least_clearance, clearance)
             checked += len(chosen)
             progress(checked, total)

@@ -208,13 +208,13 @@ def faster_ends(
             solutions = solve_seeds(seed[None], seed[None][:0], 1, joints, targets[-1], parameters)[0]
             moved = end.copy()
             moved[arm] = solutions[0] if len(solutions) else seed
-            again = _followed(problem, line, targets, arm, joints, moved)
-            arrived = len(again) > len(targets) and np.abs(again[-1] - moved).max() < SAME
-            estimated = cost(again) if arrived and path_length(again) <= max_length else np.inf
+            steered = _followed(problem, line, targets, arm, joints, moved)
+            arrived = len(steered) > len(targets) and np.abs(steered[-1] - moved).max() < SAME
+            estimated = cost(steered) if arrived and path_length(steered) <= max_length else np.inf
             if estimated >= best_cost:
                 break
             best_cost = estimated
-            faster.append((best_cost, again))
+            faster.append((best_cost, steered))
     return faster
 
 

@@ -91,11 +91,13 @@ def pose_configurations(
             aims = [_tightened(pose, fraction) for pose in poses]
         new = [at_pose(problem, aim, most, rng, exact) for aim in aims]
         solutions = [np.concatenate([earlier, more]) for earlier, more in zip(solutions, new, strict=True)]
-        found = new[0] if len(poses) == 1 else _combined(problem, poses, solutions, rng)
+        combined = new[0] if len(poses) == 1 else _combined(problem, poses, solutions, rng)
         if len(poses) > 1 or problem.constraints:
-            found = all_constraints.projected(np.concatenate([start[None], found]), GOAL_TOLERANCE_FRACTION)
-        reached = reached or len(found) > 0
-        accepted = _accepted(robot.nearest_turns(found, start), accept)
+            combined = all_constraints.projected(
+                np.concatenate([start[None], combined]), GOAL_TOLERANCE_FRACTION
+            )
+        reached = reached or len(combined) > 0
+        accepted = _accepted(robot.nearest_turns(combined, start), accept)
         before = len(configurations)
         configurations = _distinct(np.concatenate([configurations, accepted]))[:count]
         stale_rounds = 0 if len(configurations) > before else stale_rounds + 1

@@ -197,7 +197,7 @@ class CompletionTask(TrainingTask):
         for name in FAMILIES:
             held_out = self._held_out((name,), VALIDATION_SAMPLES + CALIBRATION_SAMPLES, TEST_SAMPLES)
             logits, truth, unknown = self._predictions(held_out)
-            p = (1 / (1 + np.exp(-logits / temperature)))[unknown]
+            p = 1 / (1 + np.exp(-logits[unknown] / temperature))
             truth = truth[unknown]
             predicted_occupied = p > OCCUPIED_PROBABILITY
             true_positives = float((predicted_occupied & truth).sum())

@@ -101,8 +101,8 @@ def _motions(context: PlanningContext, segments: Sequence[PlanResult]) -> list[T
             run = segments[first : k + 1]
             stopping = [segment.trajectory for segment in run]
             blended = _without_stops(context, run, first) if len(run) > 1 else None
-            stopped = sum(motion.duration for motion in stopping)
-            motions += [blended] if blended is not None and blended.duration < stopped else stopping
+            stopping_duration = sum(motion.duration for motion in stopping)
+            motions += [blended] if blended is not None and blended.duration < stopping_duration else stopping
             first = k + 1
     return motions
 

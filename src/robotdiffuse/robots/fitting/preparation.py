@@ -219,7 +219,7 @@ class Prepared(NamedTuple):
     links: tuple[LinkReport, ...]
     pairs: tuple[PairReport, ...]
     sampled: tuple[PairReport, ...]
-    """Pairs of links as sampling alone classifies them, whatever pairs the caller allows."""
+    """Pairs of links as sampling classifies them; pairs that the caller allows do not count here."""
     false_collisions: FalseCollisions
 
 
