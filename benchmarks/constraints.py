@@ -55,7 +55,6 @@ from robotdiffuse.problems.held_out import SEED, held_out_problem
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.problems.projection_kernel import project
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.simulation.world import World
 from robotdiffuse.validation.validator import verifier
@@ -181,7 +180,7 @@ class _Arm:
         self.joint_limits = (self.robot.lower, self.robot.upper)
 
     def forward_kinematics(self, q: ndarray) -> ndarray:
-        return link_pose(self.robot, q, HAND)
+        return self.robot.fk(q, HAND)
 
     def is_valid(self, q: ndarray) -> bool:
         return bool(self.checker.free(q[None])[0])

@@ -25,7 +25,6 @@ from robotdiffuse.core.transforms import rotation_about, rotation_from_rpy, tran
 from robotdiffuse.problems.compiled_constraints import rotation_vector
 from robotdiffuse.problems.held_out import SEED, held_out_problem
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
-from robotdiffuse.robots.kinematics import link_jacobians, link_pose
 from robotdiffuse.robots.robot import Robot
 
 HAND = "panda_hand"
@@ -56,7 +55,7 @@ def drawn(kind: str) -> Iterator[tuple[rd.Problem, ndarray]]:
         starts = inverse_kinematics(robot, HAND, T, 1, rng=rng, accept=free)
         if not len(starts):
             continue
-        T = link_pose(robot, starts[0], HAND)
+        T = robot.fk(starts[0], HAND)
         direction, axis = rng.normal(size=(2, 3))
         length, angle = (rng.uniform(0.15, 0.4), 0.0)
         if kind == "screw":
@@ -69,7 +68,7 @@ def drawn(kind: str) -> Iterator[tuple[rd.Problem, ndarray]]:
 
 def followed(robot: Robot, start: ndarray, end: ndarray) -> ndarray | None:
     """Configurations along the line by a plain follower; None if the follower does not reach the end."""
-    T = link_pose(robot, start, HAND)
+    T = robot.fk(start, HAND)
     translation = end[:3, 3] - T[:3, 3]
     turn = rotation_vector(end[:3, :3] @ T[:3, :3].T)
     angle = float(np.linalg.norm(turn))
@@ -80,11 +79,11 @@ def followed(robot: Robot, start: ndarray, end: ndarray) -> ndarray | None:
         target = transform(T[:3, 3] + share * translation, rotation_about(axis, share * angle) @ T[:3, :3])
         q = rows[-1]
         for _ in range(MAX_ITERATIONS):
-            T_now = link_pose(robot, q, HAND)
+            T_now = robot.fk(q, HAND)
             error = np.append(target[:3, 3] - T_now[:3, 3], rotation_vector(target[:3, :3] @ T_now[:3, :3].T))
             if np.abs(error).max() < 1e-6:
                 break
-            J = link_jacobians(robot, q[None], HAND)[0]
+            J = robot.jacobian(q, HAND)
             q = q + J.T @ np.linalg.solve(J @ J.T + DAMPING**2 * np.eye(6), error)
         else:
             return None

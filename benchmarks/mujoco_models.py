@@ -30,7 +30,6 @@ import robotdiffuse as rd
 from common import FIRST, header, parse, print_table, progress, use_processor_time
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.robots.fitting.preparation import add_robot
-from robotdiffuse.robots.kinematics import link_pose, reach
 from robotdiffuse.robots.robot import Robot
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -101,7 +100,7 @@ def world_of(file: Path, robot: Robot, rng: np.random.Generator) -> World:
             actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
             actuator.set_to_position(kp=STIFFNESS, kv=DAMPING)
     kinds = ("BOX", "CYLINDER", "CAPSULE", "SPHERE")
-    size = min(1.0, float(reach(robot)))
+    size = min(1.0, float(robot.reach))
     for i in range(OBSTACLES):
         direction = rng.normal(size=3)
         direction[2] = abs(direction[2])
@@ -134,7 +133,7 @@ def frame_error(world: World, robot: Robot, rows: ndarray) -> float:
         world.place(robot, q)
         frames = [world.data.body(name) for name in bodies] + [world.data.site(name) for name in sites]
         for name, frame in zip((*bodies, *sites), frames, strict=True):
-            T = link_pose(robot, q, name)
+            T = robot.fk(q, name)
             worst = max(worst, float(np.abs(T[:3, 3] - frame.xpos).max()))
             worst = max(worst, float(np.abs(T[:3, :3] - frame.xmat.reshape(3, 3)).max()))
     return worst

@@ -41,7 +41,6 @@ from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.kinematics import link_origins
 from robotdiffuse.scenes.shapes import Box, Cylinder, Sphere
 
 PANDA = load_robot("panda")
@@ -66,7 +65,7 @@ def even(path: Float[ndarray, "n dof"]) -> Float[ndarray, "waypoints dof"]:
 
 def sides(problem: Problem, path: Float[ndarray, "waypoints dof"]) -> tuple[int, ...]:
     """The side on which the tip passes each obstacle: 0 left, 1 right, 2 above, 3 below."""
-    tip = link_origins(problem.robot, path, problem.robot.tip)
+    tip = problem.robot.fk(path)[:, :3, 3]
     along = tip[-1] - tip[0]
     along = along / max(float(np.linalg.norm(along)), 1e-9)
     left = np.cross([0.0, 0.0, 1.0], along)

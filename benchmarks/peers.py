@@ -51,7 +51,6 @@ from robotdiffuse.core.transforms import pose_entry
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.problems.files import ProblemEntry, load_motion_bench_maker
 from robotdiffuse.problems.held_out import goal_of
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.shapes import Box, Cylinder
 from robotdiffuse.simulation.world import write_urdf
@@ -143,7 +142,7 @@ def problem_entry(case: ProblemEntry, goal: str) -> dict[str, Any]:
             entry |= {"kind": "cylinder", "radius": shape.radius, "height": shape.height}
         shapes.append(entry)
     q = goal_of(problem)
-    pose = pose_entry(link_pose(problem.robot, q, problem.robot.tip))
+    pose = pose_entry(problem.robot.fk(q))
     end = {"positions": q.tolist()} if goal == "configuration" else pose
     return {"name": case.name, "start": problem.start.tolist(), "goal": end, "shapes": shapes}
 
@@ -154,7 +153,7 @@ def asked(case: ProblemEntry, goal: str) -> rd.Problem:
     assert problem is not None
     if goal == "configuration":
         return problem
-    T = link_pose(problem.robot, goal_of(problem), problem.robot.tip)
+    T = problem.robot.fk(goal_of(problem))
     return rd.Problem(problem.robot, problem.scene, problem.start, rd.PoseGoal(problem.robot.tip, T))
 
 

@@ -62,7 +62,6 @@ from robotdiffuse.problems.goals import Goal, JointGoal, PoseGoal, PosesGoal, po
 from robotdiffuse.problems.held_out import SEED, held_out_problem
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.dynamics import Dynamics
-from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.simulation.world import World
 from robotdiffuse.validation.tolerances import goal_error
 
@@ -163,7 +162,7 @@ def together(number: int) -> Iterator[NamedProblem]:
         robot = robot.attach(rd.Box([0, 0, size[2] / 2 + 0.001], size, name="parcel"), "tool")
         T_world_base = transform(rng.uniform(-1, 1, 3), rotation_from_rpy(*rng.uniform(-3, 3, 3).tolist()))
         goals: list[Goal] = [
-            PoseGoal("parcel", T_world_base @ link_pose(robot, q, "parcel"), [0.02] * 3, [0.1, 0.1, np.pi])
+            PoseGoal("parcel", T_world_base @ robot.fk(q, "parcel"), [0.02] * 3, [0.1, 0.1, np.pi])
             for q in (held_out.goal.positions[0], held_out.start)
         ]
         world = held_out.scene.moved(T_world_base)
@@ -190,7 +189,7 @@ def both_hands(number: int) -> Iterator[NamedProblem]:
         while len(free) < 2:
             drawn = rng.uniform(robot.lower, robot.upper, (16, robot.dof))
             free = np.concatenate([free, drawn[checker.free(drawn)]])
-        poses = [PoseGoal(hand, link_pose(robot, free[1], hand)) for hand in HANDS]
+        poses = [PoseGoal(hand, robot.fk(free[1], hand)) for hand in HANDS]
         yield NamedProblem(f"baxter/{i}", Problem(robot, scene, free[0], PosesGoal(poses)))
 
 
@@ -294,7 +293,7 @@ def sequences(number: int) -> Iterator[Problem]:
             q = held_out.start + rng.uniform(-1.0, 1.0, robot.dof)
             within = ((q > robot.lower) & (q < robot.upper)).all()
             if within and not exact.collides(q[None])[0]:
-                waypoints.append(PoseGoal(HAND, link_pose(robot, q, HAND)) if i // 2 % 2 else JointGoal(q))
+                waypoints.append(PoseGoal(HAND, robot.fk(q, HAND)) if i // 2 % 2 else JointGoal(q))
         yield replace(held_out, waypoints=waypoints)
 
 
@@ -308,7 +307,7 @@ def nearest(problem: Problem, motion: Trajectory) -> list[float]:
             apart = q - goal.positions[0]
         else:
             assert isinstance(goal, PoseGoal)
-            apart = link_origins(problem.robot, q, goal.frame) - goal.T_base_frame[:3, 3]
+            apart = problem.robot.fk(q, goal.frame)[:, :3, 3] - goal.T_base_frame[:3, 3]
         distances.append(float(np.linalg.norm(apart, axis=1).min()))
     return distances
 

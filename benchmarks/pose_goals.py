@@ -23,7 +23,6 @@ from common import header, parse, print_table, progress
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.transforms import rotation_from_rpy, transform
 from robotdiffuse.robots.fitting.preparation import PreparationSettings, prepare
-from robotdiffuse.robots.kinematics import link_jacobians, link_pose, link_poses
 from robotdiffuse.robots.parsing.urdf import UrdfTree
 from robotdiffuse.robots.robot import Robot
 
@@ -66,8 +65,8 @@ def nearest_distance(
     q[1 : SEEDS // 4] = np.clip(start + rng.normal(0, 0.5, (SEEDS // 4 - 1, robot.dof)), lower, upper)
     for k in range(STEPS):
         pull = PULL if STEPS // 4 < k < STEPS - 15 else 0.0
-        poses = link_poses(robot, q, frame)
-        jacobians = link_jacobians(robot, q, frame)
+        poses = robot.fk(q, frame)
+        jacobians = robot.jacobian(q, frame)
         turned = rotation_vectors(T[:3, :3] @ poses[:, :3, :3].transpose(0, 2, 1))
         error = np.concatenate([T[:3, 3] - poses[:, :3, 3], turned], axis=1)
         drift = pull * (start - q)
@@ -76,7 +75,7 @@ def nearest_distance(
         step = drift + (jacobians.transpose(0, 2, 1) @ np.linalg.solve(damped, wanted[..., None]))[..., 0]
         length = np.linalg.norm(step, axis=1, keepdims=True)
         q = np.clip(q + step * np.minimum(1.0, 1.0 / np.maximum(length, 1e-9)), lower, upper)
-    poses = link_poses(robot, q, frame)
+    poses = robot.fk(q, frame)
     turned = rotation_vectors(T[:3, :3] @ poses[:, :3, :3].transpose(0, 2, 1))
     error = np.concatenate([T[:3, 3] - poses[:, :3, 3], turned], axis=1)
     q = q[np.abs(error).max(axis=1) < EXACT]
@@ -110,12 +109,12 @@ def length_rows(name: str, starts: int) -> list[list[str]]:
         seconds = []
         solved = 0
         for k, start in enumerate(progress([*configurations[:starts]], f"{name}, {where}")):
-            T = link_pose(robot, start, robot.tip)
+            T = robot.fk(start)
             if where == "5 cm":
                 direction = rng.normal(size=3)
                 T = transform(T[:3, 3] + 0.05 * direction / np.linalg.norm(direction), T[:3, :3])
             elif where == "anywhere":
-                T = link_pose(robot, configurations[starts + k], robot.tip)
+                T = robot.fk(configurations[starts + k])
             nearest = nearest_distance(robot, robot.tip, T, start, rng)
             if nearest == np.inf:
                 continue
@@ -162,7 +161,7 @@ def few_joints_rows(poses: int) -> list[list[str]]:
             solved = 0
             seconds = []
             for k, q in enumerate(there):
-                T = link_pose(robot, q, robot.tip)
+                T = robot.fk(q)
                 if rpy is not None:
                     turn = rng.uniform(-0.9, 0.9, 3) * np.minimum(rpy, 0.5)
                     T = T @ transform(np.zeros(3), rotation_from_rpy(*turn))
@@ -191,12 +190,12 @@ def several_rows(problems: int) -> list[list[str]]:
             start = configurations[0]
             candidates = configurations[1:]
             blocked = candidates[:10]
-            balls = [rd.Sphere(link_pose(robot, q, robot.tip)[:3, 3], 0.06) for q in blocked]
+            balls = [rd.Sphere(robot.fk(q)[:3, 3], 0.06) for q in blocked]
             exact = ExactCollision(robot, rd.Scene(balls))
             if exact.collides(start[None])[0]:
                 continue
             free = candidates[~exact.collides(candidates)][:10]
-            goals = [rd.PoseGoal(robot.tip, link_pose(robot, q, robot.tip)) for q in [*blocked, *free]]
+            goals = [rd.PoseGoal(robot.tip, robot.fk(q)) for q in [*blocked, *free]]
             problem = rd.Problem(robot, rd.Scene(balls), start, rd.AnyGoal(tuple(goals)))
             if k == 0:
                 rd.plan(problem, 1.0, until=until)

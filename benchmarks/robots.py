@@ -29,7 +29,6 @@ from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.simulation.validator import PyBulletOracle
 
@@ -147,7 +146,7 @@ def measure_inverse_kinematics(poses: int) -> None:
     start = time.perf_counter()
     inverse_kinematics(robot, FRAME, transform(np.array([0.4, 0.0, 0.4])), rng=rng)
     print(f"first call (compiled, or read from the cache): {time.perf_counter() - start:.2f} s")
-    targets = [link_pose(robot, rng.uniform(robot.lower, robot.upper), FRAME) for _ in range(poses)]
+    targets = [robot.fk(rng.uniform(robot.lower, robot.upper), FRAME) for _ in range(poses)]
     for what, count, settings in (
         ("pose, 1 solution", 1, InverseKinematicsSettings()),
         ("pose, 10 distinct solutions", 10, InverseKinematicsSettings()),
@@ -165,7 +164,7 @@ def measure_inverse_kinematics(poses: int) -> None:
             solution_counts.append(len(solutions))
             assert ((solutions > robot.lower) & (solutions < robot.upper)).all()
             for i, q in enumerate(solutions):
-                reached = link_pose(robot, q, FRAME)
+                reached = robot.fk(q, FRAME)
                 position = max(position, float(np.linalg.norm(reached[:3, 3] - T[:3, 3])))
                 rotation = max(rotation, rotation_angle(reached[:3, :3] @ T[:3, :3].T))
                 gap = min(gap, np.abs(solutions[:i] - q).max(-1).min(initial=np.inf))

@@ -38,7 +38,6 @@ def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
     from robotdiffuse.collision.kernel_arrays import compile_robot
     from robotdiffuse.learning.guidance import CollisionGuidance
     from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
-    from robotdiffuse.robots.kinematics import link_pose
     from robotdiffuse.scenes.scene_arrays import PackedScenes
     from robotdiffuse.validation.validator import Verifier
 
@@ -72,7 +71,7 @@ def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
         return np.array([report.scene_clearance, report.self_clearance], np.float64)
 
     def reached() -> ndarray:
-        goal = link_pose(robot, left, robot.tip)
+        goal = robot.fk(left)
         return np.asarray(inverse_kinematics(robot, robot.tip, goal, rng=np.random.default_rng(0)))
 
     arm = compile_robot(robot)

@@ -39,7 +39,6 @@ from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.fitting.preparation import AddReport, PreparationSettings, add_robot
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import gaps
-from robotdiffuse.robots.kinematics import link_origins
 from robotdiffuse.robots.parsing.urdf import UrdfTree
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -237,7 +236,7 @@ def past_a_box(robot: Robot, q: np.ndarray) -> Problem | None:
     straight line; None if no pair of configurations gives such a problem."""
     for start, goal in pairwise(q):
         line = np.linspace(start, goal, 33)
-        tips = link_origins(robot, line, robot.tip)
+        tips = robot.fk(line)[:, :3, 3]
         size = 0.15 * np.linalg.norm(np.ptp(tips, axis=0))
         scene = Scene([Box(tips[16], (size, size, size))])
         free = CollisionChecker(robot, scene).free(line)

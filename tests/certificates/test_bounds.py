@@ -18,7 +18,6 @@ from helpers.refusals import refuses
 from robotdiffuse.certificates import bounds as proofs
 from robotdiffuse.certificates.kinematics import Linkage
 from robotdiffuse.certificates.requirements import configurations, deviations
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.shapes import Shape
 
 TURN = [0.9, 0.1, -0.3, 0.3]
@@ -49,7 +48,7 @@ def test_links_are_where_the_validator_has_them(name: str) -> None:
     for k, link in enumerate(linkage.links):
         assert (linkage.moved[k] == robot.moved_by[robot.link_frame(link)]).all()
         for row in range(len(q)):
-            np.testing.assert_allclose(T[row, k], link_pose(robot, q[row], link), atol=1e-12)
+            np.testing.assert_allclose(T[row, k], robot.fk(q[row], link), atol=1e-12)
 
 
 def _triangle(corners: np.ndarray) -> coal.Convex:

@@ -13,7 +13,6 @@ from helpers.box_arm import HALF_WIDTH, box_arm
 from helpers.example_robots import example_robot
 from helpers.sphere_oracles import distance, solids
 from robotdiffuse.collision.exact_meshes import ExactCollision, explain_collision, forward_frames
-from robotdiffuse.robots.kinematics import link_pose
 
 Q0 = np.zeros(3)
 coordinate = st.floats(-1.5, 1.5)
@@ -122,7 +121,7 @@ def test_frames_agree_with_the_kinematics() -> None:
     frames = forward_frames(robot, q)
     for i in range(5):
         T = frames[i, robot.link_frame("tool")] @ robot.T_frame_link("tool")
-        np.testing.assert_allclose(T, link_pose(robot, q[i], "tool"), atol=1e-12)
+        np.testing.assert_allclose(T, robot.fk(q[i], "tool"), atol=1e-12)
 
 
 def test_collides_is_the_sign_of_the_distance() -> None:

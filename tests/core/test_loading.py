@@ -18,7 +18,6 @@ from robotdiffuse.core.loading import compile_seconds, compiled, loading, loadin
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.search.rrt import RRTConnect
 from robotdiffuse.robots.kinematic_tree import once_per_robot
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.trajectories import speed_limits
 
 FIRST_CALLS = """
@@ -203,7 +202,7 @@ def test_meshes_end_with_the_time() -> None:
 @pytest.mark.parametrize("cloud", [False, True])
 def test_a_tree_of_the_validator_that_takes_too_long_is_refused(cloud: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """The start collides, so the exact meshes are needed to say where."""
-    vertices = wall().vertices - wall().vertices.mean(axis=0) + link_pose(PANDA, LEFT, PANDA.tip)[:3, 3]
+    vertices = wall().vertices - wall().vertices.mean(axis=0) + PANDA.fk(LEFT)[:3, 3]
     asked = problem(rd.PointCloud(vertices, 0.01) if cloud else rd.Mesh(vertices, wall().faces))
     monkeypatch.setattr(exact_meshes, "TREE_SECONDS_PER_ELEMENT", 1e3)
     refused = RRTConnect().plan(asked, time_limit=20.0)

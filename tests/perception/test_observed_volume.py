@@ -9,7 +9,6 @@ from helpers.refusals import refuses
 from helpers.sphere_oracles import depth_of_balls
 from robotdiffuse.perception.observed_volume import ObservedVolume, minimum_table, observe
 from robotdiffuse.perception.voxel_grid import LOW, SHAPE, VOXEL
-from robotdiffuse.robots.kinematics import placed_spheres
 
 AWAY = np.array([3.0, 0.0, 0.0, -0.1, 0.0, 1.571, 0.785])
 """The arm stretched upwards, out of the way of what these views look at."""
@@ -104,7 +103,7 @@ def test_several_views_add_up() -> None:
 
 
 def test_the_arm_is_no_obstacle_and_casts_a_shadow() -> None:
-    spheres = placed_spheres(PANDA, HOME)
+    spheres = PANDA.placed_spheres(HOME)
     T = camera()
     depth = np.minimum(depth_of_balls(spheres, T, INTRINSICS, (WIDTH, HEIGHT)), 2.2)
     assert (depth < 2.19).any()

@@ -13,7 +13,6 @@ import robotdiffuse as rd
 from helpers.sphere_oracles import distance, random_shape
 from robotdiffuse.perception.ray_caster import MAX_RANGE, looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.voxel_grid import VoxelGrid
-from robotdiffuse.robots.kinematics import placed_spheres
 
 PANDA = rd.load_robot("panda")
 SIZE = (64, 48)
@@ -50,7 +49,7 @@ def test_the_arm_is_its_covering_spheres() -> None:
     q = np.array([0.3, -0.5, 0.0, -2.0, 0.0, 1.5, 0.8])
     T = looking_at(np.array([1.5, 0.5, 0.6]), np.array([0.0, 0.0, 0.4]))
     view = ray_cast(rd.Scene(), T, INTRINSICS, SIZE, PANDA, q)
-    spheres = placed_spheres(PANDA, q)
+    spheres = PANDA.placed_spheres(q)
     gaps = np.linalg.norm(view.points()[:, None] - spheres[:, :3], axis=-1) - spheres[:, 3]
     assert len(gaps) > 100 and np.abs(gaps.min(axis=1)).max() < 2e-5
     assert view.configuration is not None and (view.configuration == q).all()

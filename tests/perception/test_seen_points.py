@@ -16,7 +16,6 @@ from robotdiffuse.perception import seen_points as shown
 from robotdiffuse.perception.depth_filter import point_errors
 from robotdiffuse.perception.depth_view import SeenPoints
 from robotdiffuse.problems.files import problem_from_record, problem_record, save_problem
-from robotdiffuse.robots.kinematics import placed_spheres
 
 BALL = rd.Sphere([0.6, 0.0, 0.5], 0.15)
 K = (150.0, 150.0, 79.5, 59.5)
@@ -46,12 +45,12 @@ def test_points_lie_on_what_was_seen_and_cover_it() -> None:
 
 def test_the_arm_is_filtered_as_it_stood_then() -> None:
     for q, told in ((START, None), (GOAL, GOAL)):
-        arm = placed_spheres(PANDA, q)
+        arm = PANDA.placed_spheres(q)
         points = shown.seen_points([view(np.concatenate([arm, BALL_ROW]), told)], PANDA, START)
         to_arm = np.linalg.norm(points[:, None] - arm[None, :, :3], axis=2) - arm[:, 3]
         assert len(points) and to_arm.min() > shown.ARM_DISTANCE - shown.CELL
         assert np.abs(np.linalg.norm(points - BALL.center, axis=1) - BALL.radius).max() < 0.004
-    assert len(shown.seen_points([view(placed_spheres(PANDA, GOAL), START)], PANDA, START)) > 100
+    assert len(shown.seen_points([view(PANDA.placed_spheres(GOAL), START)], PANDA, START)) > 100
 
 
 def test_clouds_and_several_views_add_up() -> None:
@@ -75,7 +74,7 @@ def test_the_scene_is_what_is_known_and_what_was_seen() -> None:
 
 def test_points_that_an_end_is_near_are_bare() -> None:
     """A goal close to an obstacle stays valid: the radius that is added to points for safety must not make it invalid."""
-    sphere = placed_spheres(PANDA, GOAL)[-1]
+    sphere = PANDA.placed_spheres(GOAL)[-1]
     near = np.array([[sphere[0] + sphere[3] + 0.105, *sphere[1:3], 0.1]])
     problem = rd.Problem(PANDA, rd.Scene(), START, GOAL, views=[view(near)])
     radii = {s.name: s.point_radius for s in problem.scene.shapes if isinstance(s, SeenPoints)}
@@ -104,7 +103,7 @@ def test_what_is_refused() -> None:
 
 def test_what_the_arm_holds_is_not_seen_as_an_obstacle() -> None:
     held = PANDA.attach(rd.Box([0, 0, 0.2], [0.1, 0.1, 0.15], name="parcel"), "panda_hand")
-    alone = rd.DepthView(picture(placed_spheres(held, START)), K, T)
+    alone = rd.DepthView(picture(held.placed_spheres(START)), K, T)
     assert not len(shown.seen_points([alone], held, START))
     assert len(shown.seen_points([alone], PANDA, START)), "the bare arm sees the parcel"
 
@@ -112,7 +111,7 @@ def test_what_the_arm_holds_is_not_seen_as_an_obstacle() -> None:
 def test_points_of_a_pose_that_may_be_off_are_larger_and_leave_start_and_goals_free() -> None:
     """Regression: checks enlarge large points further, so starts were in collision with points that do not touch the arm."""
     error = 0.04
-    spheres = placed_spheres(PANDA, START)
+    spheres = PANDA.placed_spheres(START)
     rng = np.random.default_rng(0)
     points = spheres[rng.integers(len(spheres), size=4000), :3] + rng.uniform(-0.3, 0.3, (4000, 3))
     errors = np.tile([error, 0.0], (len(points), 1))

@@ -19,7 +19,6 @@ from robotdiffuse.perception.unknown_space import (
     probability_free,
 )
 from robotdiffuse.perception.voxel_grid import FINE, FINE_SHAPE, LOW, SHAPE, VOXEL, heaviest_part, surface, sweep
-from robotdiffuse.robots.kinematics import placed_spheres
 
 PANDA = rd.load_robot("panda")
 START = np.array([-0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
@@ -74,7 +73,7 @@ def test_swept_voxels_are_those_in_the_spheres_along_the_way() -> None:
     moving = {link for link in PANDA.spheres if PANDA.link_frame(link) > 0}
     fixed = sum(len(spheres) for link, spheres in PANDA.spheres.items() if link not in moving)
     for t in (0.0, 0.5, 1.0):
-        spheres = placed_spheres(PANDA, START + t * (START * TURNED - START))[fixed:]
+        spheres = PANDA.placed_spheres(START + t * (START * TURNED - START))[fixed:]
         distances = np.linalg.norm(centers[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]
         within = (distances < -0.002).any(axis=1)
         assert within.sum() > 20 and swept[tuple(some[within].T)].all()

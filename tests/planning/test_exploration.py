@@ -25,7 +25,6 @@ from robotdiffuse.planning.exploration.seen_free import GoalSeen, not_seen_free
 from robotdiffuse.planning.exploration.steps import DONE
 from robotdiffuse.planning.exploration.stopping import braked
 from robotdiffuse.planning.exploration.viewpoints import ReachableTree, best_viewpoints
-from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.trajectories.speed_limits import jerk_limits
 
 LEFT, RIGHT = (np.array([turn, *HOME[1:]]) for turn in (0.5, -1.7))
@@ -113,7 +112,7 @@ def test_nothing_further_than_the_margin_from_a_goal_is_exempt() -> None:
     known = OccupancyMap(PANDA)
     for low in rng.uniform(MAP.low, (0.8, 0.8, 1.0), size=(300, 3)):
         known.declare_free((tuple(low), tuple(low + rng.uniform(0.03, 0.3, size=3))))
-    spheres = placed_spheres(PANDA, HOME)
+    spheres = PANDA.placed_spheres(HOME)
     trees = [
         (KDTree(cloud.points), cloud.point_radius)
         for cloud in not_seen_free(known, rd.Scene(), RIGHT, (HOME,))

@@ -21,7 +21,6 @@ from robotdiffuse.core.transforms import rotation_angle, rotation_from_rpy, tran
 from robotdiffuse.planning import context, pose_goals
 from robotdiffuse.planning.pose_goals import pose_configurations
 from robotdiffuse.problems.files import problem_from_record, problem_record
-from robotdiffuse.robots.kinematics import link_jacobians, link_pose
 from robotdiffuse.validation.tolerances import goal_error
 
 HANDS = ("left_gripper", "right_gripper")
@@ -41,11 +40,11 @@ def free() -> ndarray:
 
 
 def poses_at(robot: rd.Robot, q: ndarray, links: Sequence[str], *tolerances: Any) -> rd.PosesGoal:
-    return rd.PosesGoal([rd.PoseGoal(link, link_pose(robot, q, link), *tolerances) for link in links])
+    return rd.PosesGoal([rd.PoseGoal(link, robot.fk(q, link), *tolerances) for link in links])
 
 
 def off(robot: rd.Robot, goal: rd.PosesGoal, q: ndarray) -> float:
-    between = [np.linalg.inv(pose.T_base_frame) @ link_pose(robot, q, pose.frame) for pose in goal.poses]
+    between = [np.linalg.inv(pose.T_base_frame) @ robot.fk(q, pose.frame) for pose in goal.poses]
     return max(max(float(np.linalg.norm(T[:3, 3])), rotation_angle(T[:3, :3])) for T in between)
 
 
@@ -93,7 +92,7 @@ def test_the_validator_names_the_hand_that_is_elsewhere() -> None:
 def test_constraints_are_kept_at_the_poses() -> None:
     """The left hand's orientation is free, but its axis must stay within 0.1 rad of upright."""
     start, there = free()[:2]
-    right = link_pose(baxter(), there, "right_gripper")
+    right = baxter().fk(there, "right_gripper")
     down = transform(np.array([0.7, 0.25, 0.4]), np.diag([1.0, -1.0, -1.0]))
     left = rd.PoseGoal("left_gripper", down, None, [0.4, 0.4, np.pi])
     goal = rd.PosesGoal([left, rd.PoseGoal("right_gripper", right)])
@@ -101,7 +100,7 @@ def test_constraints_are_kept_at_the_poses() -> None:
     problem = rd.Problem(baxter(), rd.Scene(), start, goal, constraints=[upright])
     found = pose_configurations(problem, goal, np.random.default_rng(0))
     assert len(found) and not any(goal_error(baxter(), goal, q) for q in found)
-    assert min(-link_pose(baxter(), q, "left_gripper")[2, 2] for q in found) >= np.cos(0.1)
+    assert min(-baxter().fk(q, "left_gripper")[2, 2] for q in found) >= np.cos(0.1)
 
 
 def test_a_pose_out_of_reach_is_named_alone() -> None:
@@ -158,16 +157,16 @@ def apart(robot: rd.Robot, count: int, seed: int = 5) -> ndarray:
 def followed(robot: rd.Robot, start: ndarray, shift: ndarray) -> ndarray | None:
     """The nearest configuration after the tip has moved straight by `shift`; None out of reach or near a singularity."""
     q = start.copy()
-    T = link_pose(robot, q, robot.tip)
+    T = robot.fk(q)
     target = T.copy()
     for k in range(1, 21):
         target[:3, 3] = T[:3, 3] + k / 20 * shift
         for _ in range(4):
-            now = link_pose(robot, q, robot.tip)
+            now = robot.fk(q)
             turn = target[:3, :3] @ now[:3, :3].T
             skew = 0.5 * (turn - turn.T)
             error = np.concatenate([target[:3, 3] - now[:3, 3], [skew[2, 1], skew[0, 2], skew[1, 0]]])
-            J = link_jacobians(robot, q[None], robot.tip)[0]
+            J = robot.jacobian(q)
             if np.linalg.svd(J, compute_uv=False)[-1] < 0.03:
                 return None
             q = q + np.linalg.pinv(J) @ error
@@ -182,7 +181,7 @@ def test_a_pose_where_the_hand_is_costs_no_motion(arm: str) -> None:
     robot = rd.load_robot(arm)
     for k, start in enumerate(apart(robot, 2)):
         start = start + 2 * np.pi * np.where(robot.continuous, k, 0)
-        here = rd.PoseGoal(robot.tip, link_pose(robot, start, robot.tip))
+        here = rd.PoseGoal(robot.tip, robot.fk(start))
         for goal in (here, rd.PoseGoal(robot.tip, here.T_base_frame, [0.01] * 3, [0.1, 0.1, np.pi])):
             result = rd.plan(rd.Problem(robot, FREE, start, goal), 5.0)
             assert result.path.length < 0.0001
@@ -199,10 +198,10 @@ def test_a_pose_nearby_is_reached_by_the_nearest_configuration(arm: str) -> None
         there = followed(robot, start, shift)
         if there is None:
             continue
-        T = link_pose(robot, start, robot.tip)
+        T = robot.fk(start)
         here = rd.PoseGoal(robot.tip, T)
         goal = rd.PoseGoal(robot.tip, transform(T[:3, 3] + shift, T[:3, :3]))
-        far = rd.PoseGoal(robot.tip, link_pose(robot, apart(robot, 1, seed=9)[0], robot.tip))
+        far = rd.PoseGoal(robot.tip, robot.fk(apart(robot, 1, seed=9)[0]))
         longest = 1.1 * float(np.linalg.norm(there - start))
         for problem in (
             rd.Problem(robot, FREE, start, goal),
@@ -234,7 +233,7 @@ def test_arms_of_few_joints_reach_poses_with_tolerances(arm: str, kind: str, tmp
     rpy = {"any orientation": [np.pi] * 3, "±0.5 rad": [0.5] * 3, "1 mm off": None}[kind]
     solved = 0
     for there in apart(robot, 8):
-        T = link_pose(robot, there, robot.tip)
+        T = robot.fk(there)
         if rpy is None:
             direction = rng.normal(size=3)
             T = transform(T[:3, 3] + 1e-3 * direction / np.linalg.norm(direction), T[:3, :3])
@@ -244,7 +243,7 @@ def test_arms_of_few_joints_reach_poses_with_tolerances(arm: str, kind: str, tmp
         result = rd.plan(rd.Problem(robot, FREE, apart(robot, 1)[0], goal), 10.0, until="first")
         solved += result.solved
         if result.path is not None and rpy is None:
-            off = np.linalg.norm(link_pose(robot, result.path.positions[-1], robot.tip)[:3, 3] - T[:3, 3])
+            off = np.linalg.norm(robot.fk(result.path.positions[-1])[:3, 3] - T[:3, 3])
             assert off < 4e-3, "near the pose, not at the edge of what the validator accepts"
             assert any("no configuration reaches the goal pose exactly" in note for note in result.notes)
     assert solved >= 7
@@ -252,9 +251,9 @@ def test_arms_of_few_joints_reach_poses_with_tolerances(arm: str, kind: str, tmp
 
 def many_grasps() -> tuple[rd.Problem, ndarray]:
     q = apart(PANDA, 40)
-    balls = [rd.Sphere(link_pose(PANDA, row, PANDA.tip)[:3, 3], 0.05) for row in q[1:11]]
+    balls = [rd.Sphere(PANDA.fk(row)[:3, 3], 0.05) for row in q[1:11]]
     q_free = q[11:][CollisionChecker(PANDA, rd.Scene(balls)).free(q[11:])][:10]
-    goals = [rd.PoseGoal(PANDA.tip, link_pose(PANDA, row, PANDA.tip)) for row in (*q[1:11], *q_free)]
+    goals = [rd.PoseGoal(PANDA.tip, PANDA.fk(row)) for row in (*q[1:11], *q_free)]
     return rd.Problem(PANDA, rd.Scene(balls), q[0], rd.AnyGoal(tuple(goals))), q_free
 
 
@@ -307,12 +306,12 @@ def test_the_goal_index_names_the_goal_that_is_reached() -> None:
     for goal, index in (([far, start], 1), (rd.AnyGoal((rd.JointGoal([far, near]), rd.JointGoal(start))), 1), (start, 0)):
         assert rd.plan(rd.Problem(PANDA, FREE, start, goal)).goal_index == index
     # poses 2 mm apart: both are within the validator's centimeter
-    T = link_pose(PANDA, near, PANDA.tip)
+    T = PANDA.fk(near)
     T_beside = transform(T[:3, 3] + [0.002, 0, 0], T[:3, :3])
     goals = rd.AnyGoal((rd.PoseGoal(PANDA.tip, T_beside), rd.PoseGoal(PANDA.tip, T)))
     result = rd.plan(rd.Problem(PANDA, FREE, start, goals))
     assert result.goal_index is not None
     reached = goals.goals[result.goal_index]
     assert isinstance(reached, rd.PoseGoal)
-    error = link_pose(PANDA, result.path.positions[-1], PANDA.tip) - reached.T_base_frame
+    error = PANDA.fk(result.path.positions[-1]) - reached.T_base_frame
     assert np.abs(error).max() < 1e-4

@@ -17,14 +17,13 @@ from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint
 from robotdiffuse.problems.files import problem_from_record, problem_record, save_problem
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.validation.tolerances import goal_error
 
 PANDA = rd.load_robot("panda")
 START = np.array([-0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2])
 GOAL = START + np.array([1.2, 0.1, 0.2, -0.2, 0.1, 0.2, 0.3])
 HAND = "panda_hand"
-AT = link_pose(PANDA, START, HAND)[:3, 3]
+AT = PANDA.fk(START, HAND)[:3, 3]
 EACH: list[Constraint] = [
     rd.AxisCone(HAND, [0, 0.1, 1], [0, 0, -2], 0.3),
     rd.PositionBox(HAND, [-0.2, -0.2, -0.3], [0.3, 0.2, 0.3], transform(AT, rotation_about(AT / np.linalg.norm(AT), 0.3))),
@@ -106,7 +105,7 @@ def test_speeds_are_finite_differences() -> None:
     rng = np.random.default_rng(3)
     q = rng.uniform(PANDA.lower, PANDA.upper, (10, 7))
     rates = rng.normal(size=(10, 7))
-    at = [np.array([link_pose(PANDA, row, HAND)[:3, 3] for row in q + h * rates]) for h in (-1e-6, 1e-6)]
+    at = [np.array([PANDA.fk(row, HAND)[:3, 3] for row in q + h * rates]) for h in (-1e-6, 1e-6)]
     right = np.linalg.norm(at[1] - at[0], axis=1) / 2e-6
     np.testing.assert_allclose(ready.speeds(q, rates)[:, 0], right, atol=1e-7)
 
@@ -137,7 +136,7 @@ def test_bad_input_is_refused_by_one_line() -> None:
     line = problem(EACH[4])
     refuses("cartesian_line cannot be combined", replace, line, waypoints=(GOAL,))
     refuses("2 goal configurations .* differ", PathConstraints, replace(line, goal=[START, GOAL]))  # type: ignore[arg-type]
-    loose = replace(line, goal=rd.PoseGoal(HAND, link_pose(PANDA, GOAL, HAND), [0.1, 0, 0]))
+    loose = replace(line, goal=rd.PoseGoal(HAND, PANDA.fk(GOAL, HAND), [0.1, 0, 0]))
     refuses("the goal must determine the pose of this link, but the goal has tolerances", PathConstraints, loose)
 
 
@@ -163,7 +162,7 @@ def test_projection_onto_tolerances_of_goals_agrees_with_the_validator(seed: int
     q = rng.uniform(PANDA.lower, PANDA.upper, (40, 7))
     xyz = rng.choice([0.0, 0.02, 0.3], 3)
     rpy = rng.choice([0.0, 0.1, 1.5, 3.0, np.pi], 3)
-    goal = rd.PoseGoal(HAND, link_pose(PANDA, q[0], HAND), xyz, rpy)
+    goal = rd.PoseGoal(HAND, PANDA.fk(q[0], HAND), xyz, rpy)
     ready = PathConstraints(rd.Problem(PANDA, rd.Scene(), START, goal), [goal])
     at_goal = np.array([goal_error(PANDA, goal, row) is None for row in q])
     satisfied = ready.satisfied(q)
@@ -180,7 +179,7 @@ def test_most_projections_onto_tolerances_of_a_reachable_goal_succeed() -> None:
     rng = np.random.default_rng(8)
     share = []
     for there in rng.uniform(0.8 * PANDA.lower, 0.8 * PANDA.upper, (10, 7)):
-        goal = rd.PoseGoal(HAND, link_pose(PANDA, there, HAND), [0.01] * 3, [0.1, 0.2, 0.3])
+        goal = rd.PoseGoal(HAND, PANDA.fk(there, HAND), [0.01] * 3, [0.1, 0.2, 0.3])
         ready = PathConstraints(rd.Problem(PANDA, rd.Scene(), START, goal), [goal])
         share.append(len(ready.projected(rng.uniform(PANDA.lower, PANDA.upper, (50, 7)), 0.9)) / 50)
     assert np.mean(share) > 0.3, share

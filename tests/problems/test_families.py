@@ -16,7 +16,6 @@ from robotdiffuse.problems.families import family as drawing
 from robotdiffuse.problems.families.family import CONFIGURATION, POSE, POSITION
 from robotdiffuse.problems.families.rop import ROP, Rop
 from robotdiffuse.problems.families.scaled import ScaledFamily, family_for, scale_for
-from robotdiffuse.robots.kinematics import link_pose, reach
 from robotdiffuse.robots.robot import scaled
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.surface_points import VisibleRegion, sample_surface
@@ -35,7 +34,7 @@ def test_problems_are_as_the_family_says(name: str, target: str) -> None:
         drawn = family.draw(PANDA, rng, goals=3, target=target)
         q = np.concatenate([drawn.start[None], drawn.goals]).astype(np.float64)
         assert 1 <= len(drawn.goals) <= 3 and CollisionChecker(PANDA, drawn.scene).free(q).all()
-        poses = np.stack([link_pose(PANDA, row, PANDA.tip) for row in q])
+        poses = np.stack([PANDA.fk(row) for row in q])
         if isinstance(family, Rop):
             assert ((poses[:, :3, 3] >= family.region[0]) & (poses[:, :3, 3] <= family.region[1])).all()
         np.testing.assert_allclose(poses[1:, :3, 3], [drawn.T_base_tip[:3, 3]] * len(drawn.goals), atol=1e-3)
@@ -77,7 +76,7 @@ def test_arms_like_a_panda_get_families_as_they_are(name: str) -> None:
 def test_a_scaled_arm_reaches_so_many_times_as_far_and_touches_itself_at_the_same_angles() -> None:
     robot = load_robot("ur5e")
     large = scaled(robot, 1.5)
-    assert reach(large) == pytest.approx(1.5 * reach(robot), rel=1e-9)
+    assert large.reach == pytest.approx(1.5 * robot.reach, rel=1e-9)
     q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (200, robot.dof))
     one, other = (CollisionChecker(arm, scene) for arm, scene in ((robot, EMPTY), (large, EMPTY)))
     expected = np.minimum(1.5 * one.pair_clearances(q), 1.0)  # distances are capped at a meter
@@ -92,7 +91,7 @@ def test_problems_of_an_arm_of_five_joints_and_a_third_of_the_reach(name: str) -
     drawn = family.draw(SMALL, np.random.default_rng(3), 2, POSE)
     q = np.concatenate([drawn.start[None], drawn.goals]).astype(np.float64)
     assert CollisionChecker(SMALL, drawn.scene).free(q).all()
-    tips = np.array([link_pose(SMALL, row, SMALL.tip)[:3, 3] for row in q])
+    tips = np.array([SMALL.fk(row)[:3, 3] for row in q])
     np.testing.assert_allclose(tips[1:], [drawn.T_base_tip[:3, 3]] * len(drawn.goals), atol=1e-5)
     PackedScenes.pack([drawn.scene], family.max_obstacles, floor=True)
 
@@ -105,7 +104,7 @@ def test_values_of_prismatic_joints_are_scaled_too(tmp_path: Path) -> None:
     assert isinstance(family, ScaledFamily)
     drawn = family.draw(robot, np.random.default_rng(3), 2, POSE)
     for q in drawn.goals:
-        np.testing.assert_allclose(link_pose(robot, q, robot.tip), drawn.T_base_tip, atol=1e-3)
+        np.testing.assert_allclose(robot.fk(q), drawn.T_base_tip, atol=1e-3)
     assert robot.prismatic[0] and abs(drawn.goals[0][0]) > 0.01
 
 

@@ -15,7 +15,6 @@ from helpers.commands import written
 from helpers.refusals import refuses
 from robotdiffuse.core.transforms import inverse, rotation_from_rpy, rpy_from_rotation, transform
 from robotdiffuse.problems.files import problem_from_record, problem_record
-from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.validation.tolerances import goal_error
 from robotdiffuse.validation.validator import verify_trajectory
 
@@ -39,7 +38,7 @@ def test_rpy_of_a_rotation_is_scipys() -> None:
 def off(goal: rd.PoseGoal, xyz: Any, rpy: Any) -> bool:
     """Whether a pose that differs by xyz and rpy from that of the arm at START misses the goal, which is placed there."""
     q = np.array(START)
-    T = link_pose(ROBOT, q, goal.frame) @ inverse(transform(np.array(xyz, float), rotation_from_rpy(*map(float, rpy))))
+    T = ROBOT.fk(q, goal.frame) @ inverse(transform(np.array(xyz, float), rotation_from_rpy(*map(float, rpy))))
     moved = rd.PoseGoal(goal.frame, T, goal.xyz_tolerance, goal.rpy_tolerance)
     return goal_error(ROBOT, moved, q) is not None
 
@@ -64,7 +63,7 @@ def test_a_box_of_positions_is_reached_where_its_middle_is_blocked() -> None:
     wide = rd.PoseGoal("panda_hand", AHEAD, [0.0, 0.35, 0.0], [0.0, 0.0, np.pi])
     result = rd.plan(rd.Problem(ROBOT, rd.Scene([POST]), START, wide), time_limit=10.0)
     assert result.path is not None, result.reason
-    T = inverse(AHEAD) @ link_pose(ROBOT, result.path.positions[-1], "panda_hand")
+    T = inverse(AHEAD) @ ROBOT.fk(result.path.positions[-1], "panda_hand")
     assert np.abs(T[[0, 2], 3]).max() < 1e-5 and abs(T[1, 3]) < 0.35
     assert abs(T[2, 2] - 1) < 1e-9, "upside down as asked"
 
@@ -75,7 +74,7 @@ def test_a_box_of_positions_is_reached_where_only_its_middle_is_free() -> None:
     wide = rd.PoseGoal("panda_hand", AHEAD, [0.0, 0.35, 0.0], [0.0, 0.0, np.pi])
     result = rd.plan(rd.Problem(ROBOT, rd.Scene(blocks), MIDDLE, wide), time_limit=10.0)
     assert result.path is not None, result.reason
-    assert abs(link_pose(ROBOT, result.path.positions[-1], "panda_hand")[1, 3]) < 0.2
+    assert abs(ROBOT.fk(result.path.positions[-1], "panda_hand")[1, 3]) < 0.2
 
 
 def stops(trajectory: rd.Trajectory, goal: ndarray) -> bool:
@@ -103,7 +102,7 @@ def nearest(trajectory: rd.Trajectory, goal: rd.PoseGoal | rd.JointGoal) -> floa
     q = curve(np.linspace(0, trajectory.duration, 20_000))
     if isinstance(goal, rd.JointGoal):
         return float(np.linalg.norm(q - goal.positions[0], axis=1).min())
-    return float(np.linalg.norm(link_origins(ROBOT, q, goal.frame) - goal.T_base_frame[:3, 3], axis=1).min())
+    return float(np.linalg.norm(ROBOT.fk(q, goal.frame)[:, :3, 3] - goal.T_base_frame[:3, 3], axis=1).min())
 
 
 @pytest.mark.parametrize("blend", [0.02, 0.1, 0.5])
@@ -137,7 +136,7 @@ def test_each_waypoint_has_its_own_blend() -> None:
 
 
 def test_a_waypoint_between_obstacles_is_blended_no_further_than_is_free() -> None:
-    hand = link_pose(ROBOT, np.array(MIDDLE), "panda_hand")[:3, 3]
+    hand = ROBOT.fk(MIDDLE, "panda_hand")[:3, 3]
     wall = rd.Box(hand - [0.0, 0.0, 0.18], [0.02, 0.3, 0.1], name="wall")
     problem = rd.Problem(ROBOT, rd.Scene([wall]), START, END, waypoints=[MIDDLE], blend=1.0)
     result = rd.plan(problem, time_limit=10.0)
@@ -205,7 +204,7 @@ def test_poses_are_drawn_on_as_long_as_none_is_free() -> None:
     problem = rd.Problem(ROBOT, rd.Scene([block]), [-1.5, 0.2, 0, -2.0, 0, 2.2, 0.2], narrow)
     result = rd.plan(problem, time_limit=60.0, seed=5)
     assert result.path is not None, result.reason
-    assert link_pose(ROBOT, result.path.positions[-1], "panda_hand")[1, 3] < -0.35
+    assert ROBOT.fk(result.path.positions[-1], "panda_hand")[1, 3] < -0.35
 
 
 def test_any_of_goals_may_hold_any_of_goals() -> None:

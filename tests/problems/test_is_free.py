@@ -11,10 +11,9 @@ from helpers.refusals import refuses
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.problems.units import arm_in_cloud_note, unit_notes
-from robotdiffuse.robots.kinematics import link_pose
 
 Q = np.array([0.0, 0.3, 0, -1.8, 0, 2.1, 0.8])
-HAND = link_pose(PANDA, Q, "panda_hand")[:3, 3]
+HAND = PANDA.fk(Q, "panda_hand")[:3, 3]
 PROBLEM = rd.Problem(PANDA, rd.Scene([rd.Sphere(HAND, 0.05, "ball")]), "ready", "extended")
 
 

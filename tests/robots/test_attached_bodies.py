@@ -16,7 +16,6 @@ from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_parts import convex_hull, planes_of
 from robotdiffuse.robots.fitting.covering_spheres import MAX_SPHERES, cover
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import robot_fingerprint
 from robotdiffuse.scenes.shapes import Shape
@@ -127,9 +126,9 @@ def test_a_tool_is_the_tip_and_its_shapes_are_in_the_frame_of_its_link() -> None
     T_hand_tool = transform(np.array([0.0, 0.0, 0.15]), rotation_about(np.array([1.0, 0, 0]), 0.3))
     robot = PANDA.with_tool("panda_hand", T_hand_tool, [rd.Cylinder([0, 0, 0.1], 0.01, 0.1)])
     q = np.array([0.1, 0.2, 0.3, -1.5, 0.2, 1.5, 0.3])
-    T_base_tool = link_pose(PANDA, q, "panda_hand") @ T_hand_tool
+    T_base_tool = PANDA.fk(q, "panda_hand") @ T_hand_tool
     assert robot.tip == "tool"
-    assert np.allclose(link_pose(robot, q, "tool"), T_base_tool)
+    assert np.allclose(robot.fk(q, "tool"), T_base_tool)
     on_axis = np.array([0.0, 0.0, 0.05, 1.0]), np.array([0.0, 0.0, 0.15, 1.0])
     for point in on_axis:
         local = np.linalg.inv(T_hand_tool) @ point

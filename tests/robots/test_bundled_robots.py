@@ -13,7 +13,6 @@ from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import DATA, ROBOTS, load_robot
 from robotdiffuse.robots.fitting.sphere_fitting import is_inside, stacked_planes
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import gaps
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot_folder import read_source
 
 NOTICE = (Path(__file__).parents[2] / "NOTICE").read_text()
@@ -57,7 +56,7 @@ def test_joints_that_turn_twice_are_drawn_without_needless_turns() -> None:
     least = robot.unwound(q)
     assert (np.abs(least) <= np.pi + 1e-9).all() and (least != q).any()
     for one, other in zip(q[:5], least[:5], strict=True):
-        np.testing.assert_allclose(link_pose(robot, one, "tool0"), link_pose(robot, other, "tool0"), atol=1e-9)
+        np.testing.assert_allclose(robot.fk(one, "tool0"), robot.fk(other, "tool0"), atol=1e-9)
     panda = load_robot("panda")
     middle = 0.5 * (panda.lower + panda.upper)
     assert np.array_equal(panda.unwound(middle), middle)
@@ -71,9 +70,9 @@ def test_a_pose_does_not_say_how_often_a_joint_turns() -> None:
     goals = robot.equivalent_configurations(home, start)
     assert np.allclose(goals[0], home + 2 * np.pi * np.array([0, 1, 0, 0, 1, 0])) and len(goals) == 6
     assert ((goals >= robot.lower) & (goals <= robot.upper)).all()
-    T = link_pose(robot, home, "tool0")
+    T = robot.fk(home, "tool0")
     for q in goals:
-        np.testing.assert_allclose(link_pose(robot, q, "tool0"), T, atol=1e-9)
+        np.testing.assert_allclose(robot.fk(q, "tool0"), T, atol=1e-9)
     pose = Problem(robot, rd.Scene([]), start, PoseGoal("tool0", T))
     result = rd.load_planner("aorrtc").plan(pose, time_limit=10.0, until="first")
     assert result.solved, result.reason

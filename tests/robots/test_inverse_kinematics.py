@@ -14,7 +14,6 @@ from helpers.refusals import refuses
 from robotdiffuse.core.transforms import rotation_angle, transform
 from robotdiffuse.learning.training.losses import ForwardKinematics
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
-from robotdiffuse.robots.kinematics import link_pose
 
 
 def errors(robot: rd.Robot, frame: str, T: np.ndarray, q: np.ndarray) -> tuple[float, float]:
@@ -36,7 +35,7 @@ def test_solutions_are_exact_distinct_and_within_limits(name: str) -> None:
     robot = example_robot(name)
     rng = np.random.default_rng(3)
     for _ in range(25):
-        T = link_pose(robot, rng.uniform(robot.lower, robot.upper), robot.tip)
+        T = robot.fk(rng.uniform(robot.lower, robot.upper))
         q = inverse_kinematics(robot, robot.tip, T, 10, rng=rng)
         assert 1 <= len(q) <= 10
         assert len(robot.chain(robot.tip)) < 7 or len(q) == 10
@@ -52,7 +51,7 @@ def test_ur5_has_at_most_eight_solutions() -> None:
     rng = np.random.default_rng(5)
     counts = []
     for _ in range(20):
-        T = link_pose(robot, rng.uniform(robot.lower, robot.upper), "tool0")
+        T = robot.fk(rng.uniform(robot.lower, robot.upper), "tool0")
         counts.append(len(inverse_kinematics(robot, "tool0", T, 50, rng=rng)))
     assert max(counts) == 8
 
@@ -73,7 +72,7 @@ def test_poses_that_need_a_joint_at_its_limit(limit: str) -> None:
     for joint in range(robot.dof):
         q = rng.uniform(robot.lower, robot.upper)
         q[joint] = getattr(robot, limit)[joint]
-        T = link_pose(robot, q, "panda_hand")
+        T = robot.fk(q, "panda_hand")
         assert len(inverse_kinematics(robot, "panda_hand", T, 3, rng=rng)) > 0
 
 
@@ -97,7 +96,7 @@ def test_a_narrow_range_of_acceptance_is_found() -> None:
     """Configurations near rejected ones are tried too: only a range of 0.02 rad of the elbow is accepted."""
     robot = example_robot("panda")
     rng = np.random.default_rng(8)
-    T = link_pose(robot, (robot.lower + robot.upper) / 2, "panda_hand")
+    T = robot.fk((robot.lower + robot.upper) / 2, "panda_hand")
     q = inverse_kinematics(robot, "panda_hand", T, 1, rng=rng, accept=lambda q: abs(q[:, 0] - 0.5) < 0.01)
     assert len(q) == 1
 

@@ -11,7 +11,6 @@ import robotdiffuse as rd
 from helpers.example_robots import TIPS, example_robot, planar_arm, urdf_file
 from helpers.refusals import refuses
 from robotdiffuse.learning.training.losses import ForwardKinematics
-from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot
 
@@ -81,13 +80,13 @@ def test_poses_and_jacobians_match_pinocchio(name: str, tmp_path: Path) -> None:
     for link in robot.link_names:
         T = robot.fk(q, link)
         J = robot.jacobian(q, link)
-        origins = link_origins(robot, q, link)
+        origins = robot.fk(q, link)[:, :3, 3]
         for i in range(len(q)):
             oracle.update(q[i])
             np.testing.assert_allclose(T[i], oracle.pose(link), rtol=0, atol=1e-9, err_msg=link)
             np.testing.assert_allclose(J[i], oracle.jacobian(link), rtol=0, atol=1e-9, err_msg=link)
             np.testing.assert_allclose(origins[i], oracle.pose(link)[:3, 3], rtol=0, atol=1e-9)
-            np.testing.assert_allclose(link_pose(robot, q[i], link), T[i], rtol=0, atol=1e-12)
+            np.testing.assert_allclose(robot.fk(q[i], link), T[i], rtol=0, atol=1e-12)
     np.testing.assert_allclose(robot.fk(q[0].tolist()), robot.fk(q[0], robot.tip), atol=1e-12)
 
 

@@ -19,7 +19,6 @@ from robotdiffuse.collision.kernel_arrays import reach_ball, reach_bound
 from robotdiffuse.robots.bodies import Payload, inertia_of
 from robotdiffuse.robots.fitting.covering_spheres import cover
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
-from robotdiffuse.robots.kinematics import link_pose, placed_spheres, reach
 from robotdiffuse.robots.parsing.srdf import read_srdf
 from robotdiffuse.robots.robot import Robot, robot_fingerprint
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
@@ -93,18 +92,18 @@ def test_spheres_parts_and_the_arms_of_one_robot_agree() -> None:
     assert both.dof == 14 and both.with_locked({n: 0.0 for n in both.joint_names if n[0] == "r"}).dof == 7
     q = rng.uniform(both.lower, both.upper)
     own = [both.joint_names.index(name) for name in left.joint_names]
-    np.testing.assert_allclose(link_pose(both, q, left.tip), link_pose(left, q[own], left.tip), atol=1e-12)
+    np.testing.assert_allclose(both.fk(q, left.tip), left.fk(q[own]), atol=1e-12)
 
 
 def test_the_other_arm_keeps_its_values_in_inverse_kinematics() -> None:
     robot = two_arms()
     rng = np.random.default_rng(1)
-    T = link_pose(robot, rng.uniform(robot.lower, robot.upper), "right_lower")
+    T = robot.fk(rng.uniform(robot.lower, robot.upper), "right_lower")
     rest = rng.uniform(robot.lower, robot.upper)
     found = inverse_kinematics(robot, "right_lower", T, 3, rng=rng, rest=rest)
     assert len(found) and len(robot.chain("right_lower")) == 3
     for one in found:
-        np.testing.assert_allclose(link_pose(robot, one, "right_lower"), T, atol=1e-5)
+        np.testing.assert_allclose(robot.fk(one, "right_lower"), T, atol=1e-5)
         assert (one[1:4] == rest[1:4]).all()
     assert len({*found[:, 6]}) == len(found)  # the joint after the link is random
 
@@ -140,7 +139,7 @@ def test_what_one_arm_keeps_is_not_loosened_by_the_other() -> None:
     problem = rd.Problem(robot=robot, scene=rd.Scene(), start=q[0], goal=rd.JointGoal(q[-1:]), constraints=[plane])
     bounds = constraint_bounds(problem, q, 0.0)[1][:, 0]
     heights = [
-        abs((link_pose(robot, a + share * (b - a), "right_hand")[:3, 3] - plane.point) @ plane.normal)
+        abs((robot.fk(a + share * (b - a), "right_hand")[:3, 3] - plane.point) @ plane.normal)
         for a, b in pairwise(q)
         for share in np.linspace(0, 1, 9)
     ]
@@ -179,15 +178,15 @@ def test_a_tool_on_the_second_hand_is_its_tip_and_is_checked() -> None:
 def test_both_arms_reach_as_far_as_one() -> None:
     """Regression: the reach was the sum of both arms' offsets, which doubled the width of lines on the live page."""
     both, left, right = (rd.load_robot(f"baxter{arm}") for arm in ("", "_left", "_right"))
-    assert reach(both) == pytest.approx(max(reach(left), reach(right)), rel=0.01)  # of random configurations
+    assert both.reach == pytest.approx(max(left.reach, right.reach), rel=0.01)  # of random configurations
     assert reach_bound(both) <= max(reach_bound(left), reach_bound(right)) + 1e-9
     held = both.with_locked({n: 0.0 for n in both.joint_names if n[0] == "r"})
-    assert reach(held) == pytest.approx(reach(left), rel=0.01)
+    assert held.reach == pytest.approx(left.reach, rel=0.01)
     for robot in (both, left):
         q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (50, robot.dof))
-        spheres = np.concatenate([placed_spheres(robot, one) for one in q])
+        spheres = np.concatenate([robot.placed_spheres(one) for one in q])
         far = (np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]).max()
-        assert reach(robot) < far < reach_bound(robot)
+        assert robot.reach < far < reach_bound(robot)
         center, radius = reach_ball(robot)
         assert (np.linalg.norm(spheres[:, :3] - center, axis=1) + spheres[:, 3]).max() < radius
         assert radius <= reach_bound(robot)
@@ -195,4 +194,4 @@ def test_both_arms_reach_as_far_as_one() -> None:
 
 def test_the_shoulder_of_one_joint_is_the_joint(tmp_path: Path) -> None:
     """Regression: its height counted twice."""
-    assert reach(read_urdf(written(tmp_path, chain("base", ["hinge"])))) == pytest.approx(0.0, abs=1e-9)
+    assert read_urdf(written(tmp_path, chain("base", ["hinge"]))).reach == pytest.approx(0.0, abs=1e-9)

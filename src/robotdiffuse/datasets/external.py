@@ -41,7 +41,6 @@ from robotdiffuse.datasets.shards import (
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.problem import LIMIT_SLACK, checked_configuration
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
@@ -181,7 +180,7 @@ def measured_row(
         q[-1:],
         np.array([cost]),
         cost,
-        link_pose(robot, q[-1].astype(np.float64), robot.tip),
+        robot.fk(q[-1]),
         most_goals=1,
         goal_index=0,
         family=0,

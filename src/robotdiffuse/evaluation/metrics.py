@@ -14,7 +14,6 @@ from robotdiffuse.collision.exact_meshes import forward_frames
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Configurations, Path, State, Trajectory, Values
 from robotdiffuse.datasets.rows import resample
-from robotdiffuse.robots.kinematics import link_jacobians, link_origins
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.straight_line import straight_line_time
 from robotdiffuse.validation.report import Report
@@ -139,7 +138,7 @@ def _sparc(tip: bool) -> Measure:
         state, step = _evenly(trajectory)
         rates = state.velocities
         if tip:
-            jacobians = link_jacobians(robot, state.positions, robot.tip)[:, :3]
+            jacobians = robot.jacobian(state.positions)[:, :3]
             rates = (jacobians @ rates[..., None])[..., 0]
         return spectral_arc_length(np.linalg.norm(rates, axis=1), step)
 
@@ -155,7 +154,7 @@ _METRICS = (
         "m",
         "less",
         ".2f",
-        lambda m: Path((), link_origins(m.robot, m.fine, m.robot.tip)).length,
+        lambda m: Path((), m.robot.fk(m.fine)[:, :3, 3]).length,
     ),
     # sum of the angles between successive segments in joint space; 0 for a straight line
     Metric("turning", "rad", "less", ".2f", lambda m: turning(m.path.positions)),

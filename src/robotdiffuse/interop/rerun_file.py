@@ -11,7 +11,6 @@ from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Pose, Trajectory
 from robotdiffuse.drawables import Drawable, Surface, drawables, link_surfaces, own_frame
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.kinematics import link_poses
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
 
 with needs("rerun-sdk", "rerun"):
@@ -51,9 +50,7 @@ def _log_motion(recording: rr.RecordingStream, problem: Problem, trajectory: Tra
     drawn_rows = np.unique(np.searchsorted(times, np.linspace(0, times[-1], count)).clip(0, len(times) - 1))
     drawn_times = rr.TimeColumn(TIMELINE, duration=times[drawn_rows])
     for link in robot.link_names:
-        _send_poses(
-            recording, f"robot/{link}", drawn_times, link_poses(robot, trajectory.positions[drawn_rows], link)
-        )
+        _send_poses(recording, f"robot/{link}", drawn_times, robot.fk(trajectory.positions[drawn_rows], link))
     for moving in problem.moving:
         _send_poses(
             recording, _entity(moving.name), drawn_times, [moving.pose(t) for t in times[drawn_rows].tolist()]

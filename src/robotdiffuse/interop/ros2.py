@@ -39,7 +39,6 @@ from robotdiffuse.interop.recorded_motion import (
 )
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.kinematics import link_poses
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Sphere
 
@@ -277,7 +276,7 @@ def write_mcap(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     except InputError:
         pass  # a robot that was made in Python has no problem file
     links = [link for link in robot.link_names if link != robot.base]
-    poses = {link: link_poses(robot, trajectory.positions, link) for link in links}
+    poses = {link: robot.fk(trajectory.positions, link) for link in links}
     for i, t in enumerate(trajectory.times.tolist()):
         at = round(1e9 * t)
         frames = {link: T[i] for link, T in poses.items()}

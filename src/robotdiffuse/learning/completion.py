@@ -34,7 +34,6 @@ from robotdiffuse.perception.voxel_grid import COARSE, FINE, SHAPE
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.families.family import Range, base_spheres
 from robotdiffuse.robots.kinematic_tree import once_per_robot
-from robotdiffuse.robots.kinematics import link_poses
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
@@ -83,7 +82,7 @@ def covers(robot: Robot) -> bool:
     for link, spheres in robot.spheres.items():
         if robot.link_frame(link) == 0:
             continue
-        T = link_poses(robot, q, link)
+        T = robot.fk(q, link)
         centers = np.einsum("nij,mj->nmi", T[:, :3, :3], spheres[:, :3]) + T[:, None, :3, 3]
         if (np.linalg.norm(centers - SHOULDER, axis=2) + spheres[:, 3]).max(initial=0.0) > REACH:
             return False

@@ -19,7 +19,6 @@ from robotdiffuse.perception.depth_filter import empty_regions, filtered, grown_
 from robotdiffuse.perception.depth_view import NEAREST, DepthView
 from robotdiffuse.perception.ray_caster import balls, in_camera, rectangle, render_depth
 from robotdiffuse.perception.voxel_grid import COARSE, SHAPE, VoxelGrid
-from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 
 # States of a voxel in a view.
@@ -126,7 +125,7 @@ def usable_image(
     """
     T = view.T_base_camera
     depth = filtered(view).depth
-    arm = placed_spheres(robot, q)
+    arm = robot.placed_spheres(q)
     spheres = grown_for_errors(arm, view)
     spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
     spheres[:, 3] += margin

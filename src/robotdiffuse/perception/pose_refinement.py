@@ -23,7 +23,6 @@ from robotdiffuse.perception.depth_filter import filtered, grown_for_errors, pos
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.seen_points import ARM_DISTANCE, nearest_surfaces, sphere_distances
 from robotdiffuse.perception.voxel_grid import MAP
-from robotdiffuse.robots.kinematics import link_poses, placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
@@ -191,7 +190,7 @@ class PoseRefinement:
         points = _block_points(view)
         normals, flat = _normals(points)
         spread = filtered(view).spread
-        spheres = grown_for_errors(placed_spheres(self._robot, q), view).astype(np.float32)
+        spheres = grown_for_errors(self._robot.placed_spheres(q), view).astype(np.float32)
         on_arm = sphere_distances(placed(T, points), spheres) < ARM_DISTANCE
         beside_arm = self._cameras[camera].link is None
         arm = on_arm if beside_arm else np.zeros(len(points), np.bool_)
@@ -298,7 +297,7 @@ class PoseRefinement:
 
 def is_on(robot: Robot, link: str, nominal: Pose, T: Pose, q: Configuration) -> bool:
     """Whether a camera at T = T_base_camera is the camera on `link` with T_link_camera = `nominal`."""
-    return bool(np.abs(T - link_poses(robot, q[None], link)[0] @ nominal).max() < SAME_CAMERA)
+    return bool(np.abs(T - robot.fk(q, link) @ nominal).max() < SAME_CAMERA)
 
 
 def _selected(match: _Match, ok: Bool[ndarray, "n"]) -> _Match:

@@ -14,7 +14,6 @@ from robotdiffuse.core.transforms import transform
 from robotdiffuse.core.types import Configuration, Pose
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.voxel_grid import VoxelGrid, Voxels
-from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Triangulated
@@ -238,7 +237,7 @@ def ray_cast(
     """
     solids = _solids(scene)
     if robot is not None and configuration is not None:
-        solids = np.concatenate([solids, balls(placed_spheres(robot, configuration))])
+        solids = np.concatenate([solids, balls(robot.placed_spheres(configuration))])
     depth = np.full((size[1], size[0]), MAX_RANGE, np.float32)
     render_depth(solids, np.array(intrinsics, np.float32), np.asarray(T_base_camera, np.float32), depth)
     depth[depth >= MAX_RANGE] = np.inf

@@ -15,7 +15,6 @@ from robotdiffuse.core.types import Configuration, Configurations, Points
 from robotdiffuse.perception.depth_filter import PointErrors, filtered, grown_for_errors, point_errors
 from robotdiffuse.perception.depth_view import NEAREST, DepthView, SeenPoints
 from robotdiffuse.robots.frame_kernel import write
-from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
@@ -268,7 +267,7 @@ def seen_points(views: Sequence[DepthView], robot: Robot, start: Configuration) 
         sums = np.zeros((capacity, 4), np.float32)
         count = 0
         for view in views:
-            spheres = placed_spheres(robot, start if view.configuration is None else view.configuration)
+            spheres = robot.placed_spheres(start if view.configuration is None else view.configuration)
             depth = filtered(view).depth
             spheres = grown_for_errors(spheres, view)
             spheres = (spheres + np.array([0, 0, 0, ARM_DISTANCE])).astype(np.float32)
@@ -337,7 +336,7 @@ def point_shapes(
     """
     points = points.astype(np.float32)
     shifts = ERROR_STEP * np.ceil(errors[:, 0] / ERROR_STEP)
-    ends = np.concatenate([placed_spheres(robot, q) for q in (start, *goals)]).astype(np.float32)
+    ends = np.concatenate([robot.placed_spheres(q) for q in (start, *goals)]).astype(np.float32)
     shapes = list[SeenPoints]()
     for shift in np.unique(shifts):
         alike = points[shifts == shift]

@@ -11,7 +11,6 @@ from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.collision.kernels.collision_cost import frames_of, placed
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Configuration, Path, Points
-from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 
 Voxels = Bool[ndarray, "nx ny nz"]
@@ -73,7 +72,7 @@ class VoxelGrid:
     def filled(self, robot: Robot, configurations: Iterable[Configuration], margin: float = 0.0) -> Voxels:
         """Voxels with their centers in the arm's covering spheres, inflated by `margin` [m], at any of these
         configurations."""
-        return self.within(np.concatenate([placed_spheres(robot, q) for q in configurations]), margin)
+        return self.within(np.concatenate([robot.placed_spheres(q) for q in configurations]), margin)
 
     def within(self, spheres: Float[ndarray, "n 4"], margin: float = 0.0) -> Voxels:
         """Voxels with their centers in spheres, inflated by `margin` [m]."""

@@ -30,7 +30,6 @@ from robotdiffuse.robots.inverse_kinematics import (
     ik_chain,
     inverse_kinematics,
 )
-from robotdiffuse.robots.kinematics import link_jacobians, link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.curve_timing import time_curve
 from robotdiffuse.trajectories.speed_limits import duration_of, scaled_limits, symmetric_bounds
@@ -86,7 +85,7 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
         return None
     line = next(entry for entry in problem.constraints if isinstance(entry, CartesianLine))
     T_end = line_end(problem, line)
-    T_start = link_pose(robot, problem.start, line.frame)
+    T_start = robot.fk(problem.start, line.frame)
     off = np.abs(T_end - T_start)[:, 3 if line.angle is None else slice(None)]
     if off.max() < HERE:
         rest = np.stack([problem.start, problem.start])
@@ -194,7 +193,7 @@ def faster_ends(
     max_length = LONGER * path_length(rows)
     constrained = 3 if line.angle is None else 6
     parameters = PARAMETERS._replace(position_only=line.angle is None)
-    jacobian = link_jacobians(problem.robot, end[None], line.frame)[0][:constrained, arm]
+    jacobian = problem.robot.jacobian(end, line.frame)[:constrained, arm]
     faster = list[tuple[float, Float[ndarray, "k dof"]]]()
     redundant = np.linalg.svd(jacobian)[2][constrained:]
     # with the zero offset, the line is followed to the same end again, but joints are steered to this end

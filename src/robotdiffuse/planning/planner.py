@@ -17,7 +17,6 @@ from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
 from robotdiffuse.problems.constraints import CartesianLine
 from robotdiffuse.problems.problem import Problem, check_problem
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape, Sphere
@@ -130,7 +129,7 @@ class Planner(ABC, Generic[PlannerSettings]):
         ends = [] if results[0].path is None else [results[0].path.positions[-1]]
         on_line = [start + share * (end - start) for end in ends for share in (0.5, 0.35)]
         for q in on_line:
-            ball = Sphere(link_pose(robot, q, robot.tip)[:3, 3], WARM_UP_RADIUS)
+            ball = Sphere(robot.fk(q)[:3, 3], WARM_UP_RADIUS)
             results.append(call(Problem(robot, Scene([ball]), start, goal), EASY_TIME_LIMIT))
         last = replace(problem, waypoints=(), blend=(), moving=(), start_velocity=None)
         if not problem.views:

@@ -41,7 +41,6 @@ from robotdiffuse.problems.goals import JointGoal, PoseGoal, poses_of
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.problems.projection_kernel import project_each
 from robotdiffuse.robots.inverse_kinematics import KINDS
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 
 MIN_SEGMENT_FRACTION = 1e-7
@@ -268,7 +267,7 @@ def _rows(problem: Problem, constraint: Constraint) -> list[_Row]:
 
 
 def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
-    T_start = link_pose(problem.robot, problem.start, line.frame)
+    T_start = problem.robot.fk(problem.start, line.frame)
     T_goal = line_end(problem, line)
     displacement = T_goal[:3, 3] - T_start[:3, 3]
     length = float(np.linalg.norm(displacement))
@@ -303,7 +302,7 @@ def line_end(problem: Problem, line: CartesianLine) -> Pose:
     robot = problem.robot
     goal = problem.goal
     if isinstance(goal, JointGoal):
-        poses = [link_pose(robot, q, line.frame) for q in goal.positions]
+        poses = [robot.fk(q, line.frame) for q in goal.positions]
         differences = [inverse(poses[0]) @ T for T in poses[1:]]
         if all(
             np.linalg.norm(T[:3, 3]) < SAME_POSE_TOLERANCE and rotation_angle(T[:3, :3]) < SAME_POSE_TOLERANCE

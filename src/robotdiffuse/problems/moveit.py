@@ -27,7 +27,6 @@ from robotdiffuse.core.transforms import (
 )
 from robotdiffuse.core.types import Pose, Vector
 from robotdiffuse.robots.bodies import AttachedBody, polygon_around_circle
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
 from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.scenes.point_cloud import cover_radius, occupied_voxels
@@ -444,7 +443,7 @@ class MoveItAttached:
         lacks are ignored."""
         shapes = self.shapes
         if not self.in_link and self.link in robot.link_names:
-            T_link_base = inverse(link_pose(robot, np.array(start), self.link))
+            T_link_base = inverse(robot.fk(start, self.link))
             shapes = tuple(shape.moved(T_link_base) for shape in shapes)
         touch = tuple(link for link in self.touch_links if link in robot.link_names)
         T_link_body = shapes[0].solid()[0] if shapes else np.eye(4)

@@ -8,7 +8,6 @@ from robotdiffuse.collision.kernel_arrays import reach_bound
 from robotdiffuse.core.types import Configuration, Points, Vector
 from robotdiffuse.perception.depth_view import AssumedPoints, DepthView, SeenPoints
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
@@ -60,7 +59,7 @@ def unit_notes(problem: Problem) -> tuple[str, ...]:
 def arm_in_cloud_note(robot: Robot, scene: Scene, q: Configuration) -> str:
     """A note on the cloud with the most points inside the arm at a configuration; "" if no cloud has many."""
     clouds = [shape for shape in scene.shapes if type(shape) is PointCloud]
-    spheres = placed_spheres(robot, q)
+    spheres = robot.placed_spheres(q)
     counts = [_points_within(cloud.points, spheres) for cloud in clouds]
     if max(counts, default=0) < MIN_POINTS_IN_ARM:
         return ""

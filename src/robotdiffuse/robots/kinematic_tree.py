@@ -1,4 +1,4 @@
-"""Joints and links of a robot, and data derived from them: limits, frames, chains of joints."""
+"""Joints and links of a robot, and what follows from them: limits, frames, their poses, chains of joints."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -12,8 +12,8 @@ from numpy import ndarray
 from robotdiffuse.core.bounds import Value, read_only
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.loading import loading
-from robotdiffuse.core.transforms import inverse, rotation_about, rotation_z_to, transform
-from robotdiffuse.core.types import Configuration, Configurations, JointValues, Pose, Spheres, Vector
+from robotdiffuse.core.transforms import inverse, moved_spheres, rotation_about, rotation_z_to, transform
+from robotdiffuse.core.types import Configuration, Configurations, JointValues, Pose, Poses, Spheres, Vector
 
 MOVING_KINDS = ("revolute", "continuous", "prismatic")
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
@@ -23,6 +23,11 @@ start is within pi of 0, and a goal within 2 pi of the start."""
 MIMIC_SLACK = 1e-6
 """Largest difference between a given value of a mimic joint and the value that follows from the joint that it
 mimics [rad] or [m]."""
+REACH_SAMPLES = 4096
+"""Number of random configurations at which the reach is measured."""
+REACH_QUANTILE = 0.99
+"""The reach is this quantile of the tip's distances from the shoulder, since the very largest distances are
+rare and vary with the sample."""
 
 
 class Mimic(NamedTuple):
@@ -342,6 +347,50 @@ class KinematicTree(Value):
     def T_frame_link(self, link: str) -> Pose:
         """Constant pose of the link in its frame (see `link_frame`); InputError for an unknown link."""
         return self._link(link)[1]
+
+    def frames_at(self, q: Configurations) -> list[Poses]:
+        """Poses T_base_frame [n, 4, 4] of all frames at configurations."""
+        frames = [np.tile(np.eye(4), (len(q), 1, 1))]
+        for j, parent in enumerate(self.parents):
+            motion = np.tile(np.eye(4), (len(q), 1, 1))
+            if self.prismatic[j]:
+                motion[:, 2, 3] = q[:, j]
+            else:
+                motion[:, 0, 0] = motion[:, 1, 1] = np.cos(q[:, j])
+                motion[:, 1, 0] = np.sin(q[:, j])
+                motion[:, 0, 1] = -motion[:, 1, 0]
+            frames.append(frames[parent] @ self.frame_offsets[j] @ motion)
+        return frames
+
+    def placed_spheres(self, q: Configuration) -> Spheres:
+        """All collision spheres at one configuration, x y z radius in the base frame [m]."""
+        frames = self.frames_at(q[None])
+        parts = [np.zeros((0, 4))]
+        for link, spheres in self.spheres.items():
+            T = frames[self.link_frame(link)][0] @ self.T_frame_link(link)
+            parts.append(moved_spheres(T, spheres))
+        return np.concatenate(parts)
+
+    @cached_property
+    def reach(self) -> float:
+        """Distance between tip and shoulder that 99 % of the configurations do not exceed [m].
+
+        The shoulder is the point on the first joint's axis at the height of the second joint, or of the first
+        if it is the only one. With several arms, the largest reach of an arm is returned.
+        """
+        q = np.random.default_rng(0).uniform(self.lower, self.upper, (REACH_SAMPLES, self.dof))
+        frames = self.frames_at(q)
+        reached = []
+        for tip in self.tips:
+            first = list(self.chain(tip)[:2])
+            if not first:  # all joints of this arm are locked
+                continue
+            offsets = self.frame_offsets[first]
+            second = offsets[0] @ offsets[1] if len(first) > 1 else offsets[0]
+            shoulder = np.array([*offsets[0, :2, 3], second[2, 3]])
+            origins = (frames[self.link_frame(tip)] @ self.T_frame_link(tip))[:, :3, 3]
+            reached.append(np.linalg.norm(origins - shoulder, axis=1))
+        return float(np.quantile(reached, REACH_QUANTILE, axis=1).max())
 
     def check_moved(self, field: str, link: str) -> None:
         """Raises InputError, with `field` in its message, unless a planned joint moves the link."""

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache, reduce
 from itertools import combinations
@@ -34,7 +34,6 @@ from robotdiffuse.robots.kinematic_tree import (
     KinematicTree,
     with_mimics,
 )
-from robotdiffuse.robots.kinematics import link_jacobians, link_poses
 
 ROUNDING = 1e-5
 """Upper bound on the rounding error of a joint value [rad] or [m]."""
@@ -181,7 +180,10 @@ class Robot(KinematicTree):
             >>> rd.load_robot("panda").fk([0, -0.785, 0, -2.356, 0, 1.571, 0.785])[:3, 3].round(2).tolist()
             [0.31, 0.0, 0.59]
         """
-        return self._of_link(link_poses, q, link)
+        rows = configurations(self, q)
+        name = link or self.tip
+        T = self.frames_at(np.atleast_2d(rows))[self.link_frame(name)] @ self.T_frame_link(name)
+        return T[0] if rows.ndim == 1 else T
 
     def jacobian(self, q: ArrayLike, link: str | None = None) -> ndarray:
         """Geometric Jacobian of a link.
@@ -199,12 +201,18 @@ class Robot(KinematicTree):
         Raises:
             InputError: For an unknown link, or q of the wrong shape.
         """
-        return self._of_link(link_jacobians, q, link)
-
-    def _of_link(self, function: Callable[..., ndarray], q: ArrayLike, link: str | None) -> ndarray:
         rows = configurations(self, q)
-        values = function(self, np.atleast_2d(rows), link or self.tip)
-        return values[0] if rows.ndim == 1 else values
+        name = link or self.tip
+        frames = self.frames_at(np.atleast_2d(rows))
+        origins = (frames[self.link_frame(name)] @ self.T_frame_link(name))[:, :3, 3]
+        chain = list(self.chain(name))
+        slides = np.array(self.prismatic)[chain, None, None]
+        T = np.array(frames)[1:][chain]
+        axes = T[..., :3, 2]
+        J = np.zeros((len(origins), 6, self.dof))
+        J[:, :3, chain] = np.where(slides, axes, np.cross(axes, origins - T[..., :3, 3])).transpose(1, 2, 0)
+        J[:, 3:, chain] = np.where(slides, 0.0, axes).transpose(1, 2, 0)
+        return J[0] if rows.ndim == 1 else J
 
     def ik(
         self,

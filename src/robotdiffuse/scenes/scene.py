@@ -12,7 +12,6 @@ from robotdiffuse.core.bounds import Value
 from robotdiffuse.core.errors import InputError, check_name, joined, shown, unknown_name
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation, transform
 from robotdiffuse.core.types import Configuration, Pose
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 
@@ -183,7 +182,7 @@ class Scene(Value):
         check_name("obstacle to attach:", name, obstacles)
         link = robot.tip if link is None else link
         robot.link_frame(link)  # raises InputError, with the known links, for an unknown one
-        taken_shape = obstacles.pop(name).moved(inverse(link_pose(robot, np.asarray(q, float), link)))
+        taken_shape = obstacles.pop(name).moved(inverse(robot.fk(q, link)))
         return self.with_shapes(obstacles.values()), robot.attach(taken_shape, link, touch_links)
 
     def detach(self, name: str, robot: Robot, q: Configuration) -> tuple["Scene", Robot]:
@@ -202,7 +201,7 @@ class Scene(Value):
         """
         robot_without = robot.detach(name)
         [body] = [body for body in robot.attached if body.name == name]
-        T_base_link = link_pose(robot, np.asarray(q, float), body.link)
+        T_base_link = robot.fk(q, body.link)
         released = [shape.moved(T_base_link) for shape in body.shapes if isinstance(shape, Shape)]
         return self.with_shapes([*self.shapes, *released]), robot_without
 

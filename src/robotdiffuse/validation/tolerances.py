@@ -12,7 +12,6 @@ from robotdiffuse.core.settings import Bound, Natural, NotNegative, Positive, Se
 from robotdiffuse.core.transforms import inverse, rotation_angle, rpy_from_rotation
 from robotdiffuse.core.types import Configuration, Configurations, JointRows, Pose, Values, interpolated
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal
-from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.robots.robot import Robot
 
 
@@ -121,7 +120,7 @@ def goal_error(
             return None
         return GoalError(f"{off:.3g} from the nearest goal configuration (largest joint error)", None, off)
     if goal.frame not in poses:
-        poses[goal.frame] = link_pose(robot, q, goal.frame)
+        poses[goal.frame] = robot.fk(q, goal.frame)
     T_goal_end = inverse(goal.T_base_frame) @ poses[goal.frame]
     distance = float(np.linalg.norm(T_goal_end[:3, 3]))
     angle = rotation_angle(T_goal_end[:3, :3])
@@ -207,7 +206,7 @@ def _near(
         return (np.linalg.norm(differences, axis=2) <= reach).any(axis=0)
     xyz = goal.xyz_tolerance
     tolerance = settings.goal_distance if xyz is None else float(np.linalg.norm(xyz + settings.goal_slack))
-    offsets = link_origins(robot, q, goal.frame) - goal.T_base_frame[:3, 3]
+    offsets = robot.fk(q, goal.frame)[:, :3, 3] - goal.T_base_frame[:3, 3]
     return np.linalg.norm(offsets, axis=1) <= tolerance + blend
 
 

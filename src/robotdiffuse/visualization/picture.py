@@ -19,7 +19,6 @@ from robotdiffuse.core.settings import Bound, Natural, NotNegative, Settings
 from robotdiffuse.core.types import Configuration, Configurations, Path, Points, Rotation, Trajectory, Vector
 from robotdiffuse.drawables import GOAL, START, Color, Drawable, Surface, drawables, join, painted
 from robotdiffuse.perception.ray_caster import looking_at
-from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
@@ -363,7 +362,7 @@ def render(
 
 def _shell(arm: DrawnArm, q: Configuration, thickness: float) -> Surface:
     """The safety shell: the covering spheres of the arm at q, enlarged by a thickness [m]."""
-    spheres = placed_spheres(arm.robot, q)
+    spheres = arm.robot.placed_spheres(q)
     return join([_ball(sphere[:3], sphere[3] + thickness, WHITE, 3) for sphere in spheres])
 
 

@@ -26,7 +26,6 @@ from robotdiffuse.interop import read_motion, write_motion
 from robotdiffuse.interop.recorded_motion import joint_trajectory, motion_of_robot
 from robotdiffuse.problems.files import load_motion_bench_maker, load_problem, problem_from_record, problem_record
 from robotdiffuse.robots import DATA, load_robot, read_robot_folder
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.parsing.srdf import read_srdf
 from robotdiffuse.robots.parsing.urdf import UrdfTree, read_limits, with_limits
 from robotdiffuse.scenes.point_cloud import read_points
@@ -286,7 +285,7 @@ def _bundle(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
 
     def read() -> None:
         robot = read_robot_folder(folder)
-        link_pose(robot, (robot.lower + robot.upper) / 2, robot.tip)
+        robot.fk((robot.lower + robot.upper) / 2)
 
     return read
 

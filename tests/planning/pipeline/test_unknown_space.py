@@ -18,7 +18,6 @@ from robotdiffuse.perception.voxel_grid import COARSE, FINE, heaviest_part
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.pipeline import unknown_space
 from robotdiffuse.planning.planner import Planner
-from robotdiffuse.robots.kinematics import placed_spheres
 
 PANDA = rd.load_robot("panda")
 START = np.array([-0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
@@ -108,7 +107,7 @@ def test_occupied_crosses_nothing_unknown_but_at_the_ends(planner: Planner) -> N
 
 def test_an_end_in_what_was_seen_is_named_which_may_be_the_arm_itself(planner: Planner) -> None:
     blocked = rd.Scene([rd.Box(PANDA.fk(GOAL)[:3, 3], [0.3, 0.3, 0.3])])
-    inside = SeenPoints(placed_spheres(PANDA, GOAL)[-30:, :3], 0.001, name="seen_at_ends")
+    inside = SeenPoints(PANDA.placed_spheres(GOAL)[-30:, :3], 0.001, name="seen_at_ends")
     own = rd.Problem(PANDA, rd.Scene([inside]), START, GOAL)
     for problem, told in ((partial("padded", taken(blocked)), ""), (own, "may be the arm's own")):
         result = planner.plan(problem, time_limit=4.0)
@@ -117,7 +116,7 @@ def test_an_end_in_what_was_seen_is_named_which_may_be_the_arm_itself(planner: P
 
 
 def test_assumptions_are_carved_free_at_the_ends() -> None:
-    ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, GOAL)]).astype(np.float32)
+    ends = np.concatenate([PANDA.placed_spheres(q) for q in (START, GOAL)]).astype(np.float32)
     solid = np.ones(FINE.shape, np.bool_)
     volume = observe([taken(DEEP)], PANDA, START)
     policies = ("padded", "occupied")

@@ -12,7 +12,6 @@ from helpers.refusals import refuses
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.transforms import inverse, rotation_about, transform
 from robotdiffuse.problems.files import problem_from_record, problem_record, save_problem
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.shapes import Shape
 
 START = [-0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2]
@@ -53,19 +52,19 @@ def test_a_goal_may_name_the_tool_and_what_is_held(tmp_path: Path) -> None:
         problem = rd.load_problem(written(tmp_path, PLAIN | extra | {"goal": goal}))
         result = rd.plan(problem, time_limit=10.0)
         assert result.path is not None, result.reason
-        T = link_pose(problem.robot, result.path.positions[-1], frame)
+        T = problem.robot.fk(result.path.positions[-1], frame)
         assert np.allclose(T[:3, 3], [0.45, 0.3, 0.3], atol=1e-4)
 
 
 def test_base_moves_scene_goal_and_views_into_the_bases_frame() -> None:
     robot = rd.load_robot("panda")
-    T_world_goal = T_WORLD_BASE @ link_pose(robot, np.array(GOAL), "panda_hand")
+    T_world_goal = T_WORLD_BASE @ robot.fk(GOAL, "panda_hand")
     view = rd.DepthView(np.full((4, 4), 5.0), (4, 4, 2, 2), T_WORLD_BASE)
     scene = rd.Scene(SHAPES).moved(T_WORLD_BASE)
     goal = rd.PoseGoal("panda_hand", T_world_goal)
     problem = rd.Problem.in_world(T_WORLD_BASE, robot, scene, START, goal, views=[view])
     assert isinstance(problem.goal, rd.PoseGoal)
-    assert np.allclose(problem.goal.T_base_frame, link_pose(robot, np.array(GOAL), "panda_hand"))
+    assert np.allclose(problem.goal.T_base_frame, robot.fk(GOAL, "panda_hand"))
     assert np.allclose(problem.views[0].T_base_camera, np.eye(4))
     for given, moved in zip(SHAPES, problem.known_scene.shapes, strict=True):
         assert np.allclose(given.bounds, moved.bounds, atol=1e-9)
@@ -80,7 +79,7 @@ def test_distances_are_the_same_in_the_world() -> None:
     here = ExactCollision(robot, scene).link_distances(q)
     for there in (ExactCollision(robot, problem.scene), ExactCollision(standing, world)):
         assert np.allclose([d.distance for d in here], [d.distance for d in there.link_distances(q)], atol=1e-6)
-    T = inverse(link_pose(standing, q, "panda_hand")) @ T_WORLD_BASE @ link_pose(robot, q, "panda_hand")
+    T = inverse(standing.fk(q, "panda_hand")) @ T_WORLD_BASE @ robot.fk(q, "panda_hand")
     assert np.allclose(T, np.eye(4), atol=1e-12)
 
 

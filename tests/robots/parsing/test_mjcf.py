@@ -14,7 +14,6 @@ from helpers.refusals import refuses
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.robots.fitting.preparation import add_robot
 from robotdiffuse.robots.fitting.self_collisions import SamplingSettings
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.parsing.urdf import UrdfTree
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
@@ -96,7 +95,7 @@ def test_frames_are_those_of_mujoco(file: Path) -> None:
         found = [(data.body(name).xpos, data.body(name).xmat, name) for name in bodies]
         found.append((data.site("tool").xpos, data.site("tool").xmat, "tool"))
         for position, rotation, name in found:
-            T = link_pose(robot, q, name)
+            T = robot.fk(q, name)
             np.testing.assert_allclose(T[:3, 3], position, atol=1e-9)
             np.testing.assert_allclose(T[:3, :3], rotation.reshape(3, 3), atol=1e-9)
 
@@ -237,7 +236,7 @@ def test_a_base_on_slides_without_range_is_held(actuator: str, tmp_path: Path) -
     assert robot.joint_names == ("j",)
     assert robot.poses["home"] == {"j": 0.5}
     assert any("slide joint x" in note and "is held" in note for note in robot.notes)
-    np.testing.assert_allclose(link_pose(robot, np.array([0.0]), "base")[:3, 3], [0.1, 0, 0.2], atol=1e-12)
+    np.testing.assert_allclose(robot.fk(np.array([0.0]), "base")[:3, 3], [0.1, 0, 0.2], atol=1e-12)
 
 
 TURNED = """
@@ -266,7 +265,7 @@ def test_mirrored_meshes_are_where_mujoco_has_them_and_what_is_not_driven_is_non
     assert robot.joint_names == ("j",) and "other" not in robot.link_names
     data = state_of(mujoco.MjModel.from_xml_path(str(tmp_path / "m.xml")), robot, np.array([0.5]))
     for name in ("base", "arm"):
-        T = link_pose(robot, np.array([0.5]), name)
+        T = robot.fk(np.array([0.5]), name)
         np.testing.assert_allclose(T[:3, 3], data.body(name).xpos, atol=1e-9)
         np.testing.assert_allclose(T[:3, :3], data.body(name).xmat.reshape(3, 3), atol=1e-9)
     [wedge] = tree.surfaces("base")

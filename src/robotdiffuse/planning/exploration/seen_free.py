@@ -27,7 +27,6 @@ from robotdiffuse.perception.seen_points import sphere_distances
 from robotdiffuse.perception.unknown_space import CARVING_MARGIN, without_known
 from robotdiffuse.perception.visibility import BALL_RADIUS, see_through, surface_balls, within_voxels
 from robotdiffuse.perception.voxel_grid import MAP, VoxelGrid, Voxels, refined, surface
-from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Shape
@@ -56,7 +55,7 @@ def not_seen_free(
     unseen = ~(known.free | near_ends(known, (start,)))
     spheres = np.zeros((0, 4))
     if goals:
-        spheres = np.concatenate([placed_spheres(known.robot, q) for q in goals])
+        spheres = np.concatenate([known.robot.placed_spheres(q) for q in goals])
     near = MAP.within(spheres, CARVING_MARGIN + COVER_RADIUS)
     at = surface(unseen)
     points = MAP.centers(at[~near[tuple(at.T)]])
@@ -105,7 +104,7 @@ def least_unknown(known: OccupancyMap, goals: Configurations) -> Configuration:
 def reaches_outside(robot: Robot, q: Configuration) -> bool:
     """Whether the arm reaches out of the map: the centers of some of its covering spheres are outside."""
     low, high = _corners_of_map()
-    centers = placed_spheres(robot, q)[:, :3]
+    centers = robot.placed_spheres(q)[:, :3]
     return bool(((centers < low) | (centers > high)).any())
 
 
@@ -230,7 +229,7 @@ class GoalSeen:
 
     def _distances(self, balls: Points, q: Configuration) -> Float32[ndarray, "n"]:
         """Signed distances of the balls' centers to the arm's covering spheres at a configuration [m]."""
-        return sphere_distances(balls, placed_spheres(self._robot, q).astype(np.float32))
+        return sphere_distances(balls, self._robot.placed_spheres(q).astype(np.float32))
 
 
 def _key(q: Configuration) -> tuple[float, ...]:

@@ -12,7 +12,6 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
 from robotdiffuse.core.types import Configurations, Pose
 from robotdiffuse.perception.voxel_grid import Voxels
-from robotdiffuse.robots.kinematics import link_poses
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
@@ -52,7 +51,7 @@ class ArmCamera(Value):
         Raises:
             InputError: If the robot lacks the link.
         """
-        return link_poses(robot, q, self.link) @ self.T_link_camera
+        return robot.fk(q, self.link) @ self.T_link_camera
 
 
 # What a step asks for.

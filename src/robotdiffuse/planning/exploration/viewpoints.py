@@ -28,7 +28,6 @@ from robotdiffuse.planning.exploration.steps import ArmCamera
 from robotdiffuse.planning.pipeline.unknown_space import policy_for, unknown_space_of
 from robotdiffuse.planning.search.rrt_kernel import branch, extend, make_trees
 from robotdiffuse.problems.problem import PREDICTED, Problem, check_problem
-from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.trajectories.simplification import simplify
@@ -79,7 +78,7 @@ class ReachableTree:
 def moved(robot: Robot, to: Configurations, others: Sequence[Configuration]) -> Float[ndarray, "n"]:
     """For each configuration of `to`, how far the arm moves to it from the nearest configuration of `others`:
     the mean over the arm's covering spheres [m]."""
-    reached, away = (np.stack([placed_spheres(robot, q)[:, :3] for q in rows]) for rows in (to, others))
+    reached, away = (np.stack([robot.placed_spheres(q)[:, :3] for q in rows]) for rows in (to, others))
     return np.min([np.linalg.norm(reached - other, axis=2).mean(axis=1) for other in away], axis=0)
 
 

@@ -47,7 +47,6 @@ from robotdiffuse.perception.voxel_grid import Probabilities, refined
 from robotdiffuse.planning.context import PlanningContext, PlanRequest, Solver
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import OCCUPIED, OPTIMISTIC, PADDED, PREDICTED, JointGoal, Problem
-from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.scenes.point_cloud import voxel_thin
 
 # Under an assumption, at most MAX_FIRST_MOTIONS first motions are planned. The risk of a motion is the sum of
@@ -225,7 +224,7 @@ def predicted_obstacles(problem: Problem) -> AssumedPoints:
     from robotdiffuse.learning.completion import predict
 
     volume = observe(problem.views, problem.robot, problem.start)
-    arm = placed_spheres(problem.robot, problem.start).astype(np.float32)
+    arm = problem.robot.placed_spheres(problem.start).astype(np.float32)
     likely = predict(volume) > PICTURE_THRESHOLD
     return OccupiedVoxels("likely", likely, problem.robot, problem.known_scene).obstacles(arm)
 
@@ -242,7 +241,7 @@ def _goals(context: PlanningContext, as_seen: Problem) -> Configurations | PlanR
 def with_assumption(problem: Problem, assumption: Assumption, goals: Configurations) -> Problem:
     """The problem with an assumption's obstacles added to the observed scene, except those at the start or at
     the goals. Only the goals at which the fewest obstacles have to be removed are kept."""
-    start, *at_goals = (placed_spheres(problem.robot, q).astype(np.float32) for q in (problem.start, *goals))
+    start, *at_goals = (problem.robot.placed_spheres(q).astype(np.float32) for q in (problem.start, *goals))
     several = at_goals if len(at_goals) > 1 else ()
     touched = np.array([assumption.touched(spheres).sum() for spheres in several] or [0])
     easiest = np.flatnonzero(touched == touched.min())

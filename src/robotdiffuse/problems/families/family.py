@@ -16,7 +16,6 @@ from robotdiffuse.core.transforms import moved_spheres
 from robotdiffuse.core.types import Configuration, Configurations, JointRows, Pose
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
-from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
@@ -160,7 +159,7 @@ def uniform_configurations(
     configurations = np.zeros((0, robot.dof))
     for _ in range(MAX_BATCHES):
         q = robot.unwound(rng.uniform(robot.lower, robot.upper, (BATCH_SIZE, robot.dof)))
-        xyz = link_origins(robot, q, robot.tip)
+        xyz = robot.fk(q)[:, :3, 3]
         q = q[((xyz >= region[0]) & (xyz <= region[1])).all(axis=1)]
         configurations = np.concatenate([configurations, q[checker.free(q)] if len(q) else q])
         if len(configurations) >= count:
@@ -213,7 +212,7 @@ def between_targets(
             return None
     (start,), q = reached
     if settings.position_only or robot.dof < MIN_POSE_DOF:
-        T_base_tip = link_pose(robot, q[0].astype(np.float64), robot.tip)
+        T_base_tip = robot.fk(q[0])
     return SampledProblem(scene, start, q, T_base_tip)
 
 

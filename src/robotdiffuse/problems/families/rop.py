@@ -28,7 +28,6 @@ from robotdiffuse.problems.families.family import (
     sample_until_found,
     uniform_configurations,
 )
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import IDENTITY, Box, Sphere
@@ -146,7 +145,7 @@ class Rop(Ranges):
         if sum(map(len, samples)) < 2:
             return None
         start, goal = np.concatenate(samples)
-        T_base_tip = link_pose(robot, goal, robot.tip)
+        T_base_tip = robot.fk(goal)
         if target == CONFIGURATION:
             return SampledProblem(scene, start, goal[None], T_base_tip)
         reached = goal[None].astype(np.float32)

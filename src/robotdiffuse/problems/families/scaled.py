@@ -14,13 +14,12 @@ from numpy.random import Generator
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.families.family import CONFIGURATION, Family, SampledProblem, Spheres
 from robotdiffuse.robots.kinematic_tree import once_per_robot
-from robotdiffuse.robots.kinematics import reach
 from robotdiffuse.robots.robot import Robot, scaled
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Shape
 
 PANDA_REACH = 0.855
-"""A Panda's reach, as computed by `robots.kinematics.reach` [m]."""
+"""A Panda's reach, as computed by `Robot.reach` [m]."""
 UNSCALED_RANGE = (0.8, 1.25)
 """Families are not scaled for arms whose reach, relative to a Panda's, is in this range."""
 
@@ -28,7 +27,7 @@ UNSCALED_RANGE = (0.8, 1.25)
 @once_per_robot
 def scale_for(robot: Robot) -> float:
     """The factor that scales the lengths of families to an arm."""
-    ratio = reach(robot) / PANDA_REACH
+    ratio = robot.reach / PANDA_REACH
     return 1.0 if UNSCALED_RANGE[0] <= ratio <= UNSCALED_RANGE[1] else round(ratio, 2)
 
 

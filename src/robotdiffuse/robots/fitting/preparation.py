@@ -47,7 +47,6 @@ from robotdiffuse.robots.fitting.sphere_fitting import (
     stick_out,
 )
 from robotdiffuse.robots.kinematic_tree import MOVING_KINDS
-from robotdiffuse.robots.kinematics import reach
 from robotdiffuse.robots.parsing.srdf import read_srdf, srdf_beside
 from robotdiffuse.robots.parsing.urdf import UrdfTree, read_limits, with_limits
 from robotdiffuse.robots.robot import Robot
@@ -272,7 +271,7 @@ def prepare(
     """
     # the reach is measured with prismatic joints locked, since a long rail does not make an arm larger
     slides = {j.name: (j.lower + j.upper) / 2 for j in robot.planned_joints if j.kind == "prismatic"}
-    arm_reach = 0.0 if len(slides) == robot.dof else reach(robot.with_locked(slides))
+    arm_reach = 0.0 if len(slides) == robot.dof else robot.with_locked(slides).reach
     settings = settings.for_reach(arm_reach)
     links = {name: _Link(name, meshes, settings.parts) for name, meshes in surfaces.items()}
     steps = 2 * len(links) + 1 + settings.rounds

@@ -35,7 +35,6 @@ from robotdiffuse.core.types import Points, Pose, Values
 from robotdiffuse.robots.bodies import ConvexMesh, Inertia, inertia_of, polygon_around_circle
 from robotdiffuse.robots.fitting.convex_parts import MIN_THICKNESS, Surface, convex_hull, thickened
 from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT, MOVING_KINDS, Joint, Mimic, with_mimics
-from robotdiffuse.robots.kinematics import reach
 from robotdiffuse.robots.parsing.mjcf import ConvertedModel, ellipsoid
 from robotdiffuse.robots.parsing.packages import Packages, compiled_xacro, is_xacro, with_prefixes
 from robotdiffuse.robots.parsing.srdf import Srdf, planned_joints, refuse_linkages
@@ -260,7 +259,7 @@ class UrdfTree:
                 f"check the units: link {link} is {size:.4g} m long; lengths are in meters, and a mesh in "
                 f'millimeters needs scale="0.001 0.001 0.001"'
             )
-            if robot.link_frame(link) > 0 and size > MAX_SIZE_PER_REACH * reach(robot):
+            if robot.link_frame(link) > 0 and size > MAX_SIZE_PER_REACH * robot.reach:
                 raise InputError(f"{self.path}: {note}")
             notes.append(note)
         return notes

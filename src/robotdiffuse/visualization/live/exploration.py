@@ -37,7 +37,6 @@ from robotdiffuse.planning.exploration.steps import (
 )
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.kinematics import reach
 from robotdiffuse.visualization.arm import DrawnArm
 from robotdiffuse.visualization.exploration import (
     LOOK_COLOR,
@@ -399,7 +398,7 @@ class ExplorationPage(LivePage):
         look = record if record is not None and record.step.kind == LOOK else None
         self._look.show(None if look is None else look.waypoints[-1])
         edges = [] if look is None else frustum(explorer, look)
-        width = 0.5 * TRACE_WIDTH * reach(explorer.robot)
+        width = 0.5 * TRACE_WIDTH * explorer.robot.reach
         draw_lines(self.server, "/pyramid", edges, [np.array(LOOK_COLOR, float)] * len(edges), width)
 
     def _show_panel(self, state: ExplorationState) -> None:

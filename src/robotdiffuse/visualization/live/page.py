@@ -21,7 +21,6 @@ from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from
 from robotdiffuse.core.types import Configuration, Pose, Trajectory, Tree, interpolated
 from robotdiffuse.drawables import GOAL, START, Color, Drawable, Surface, drawables, own_frame, thinned
 from robotdiffuse.planning import PLANNERS
-from robotdiffuse.robots.kinematics import link_pose, reach
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
@@ -75,7 +74,7 @@ class LivePage(ABC):
         self._open = threading.Lock()
         self._closed = False
         self._drawing = LatestTask(self._draw_if_open, "draw")
-        server.add_stage(reach(robot))
+        server.add_stage(robot.reach)
 
     def close(self) -> None:
         """Stop serving and end all threads."""
@@ -160,7 +159,7 @@ class Page(LivePage):
                 self._obstacle_gizmo.show(own_frame(shapes[selected]) if selected in shapes else None)
             if new("moving", problem.moving):
                 self._show_moving(0.0)
-            self._start_gizmo.show(link_pose(robot, problem.start, robot.tip))
+            self._start_gizmo.show(robot.fk(problem.start))
             if new("start", problem.start, state.motion):
                 at_start = motion is None or np.allclose(motion.positions[0], problem.start)
                 self._arms["start"].show(None if at_start else problem.start)
@@ -191,7 +190,7 @@ class Page(LivePage):
             "contact": draw("contact", self._drawn, RED, 2 * GHOST_OPACITY),
         }
         for gizmo in self._gizmos:
-            gizmo.handle.scale = gizmo.size * reach(robot)
+            gizmo.handle.scale = gizmo.size * robot.reach
         problem = self.session.state.problem
         goal = self.session.state.goal_configuration
         ends = np.stack([problem.start, problem.start if goal is None else goal])
@@ -692,7 +691,7 @@ def draw_trace(server: viser.ViserServer, arm: DrawnArm, motion: Trajectory | No
     points = arm.trace(motion.positions)
     share = np.linspace(0, 1, len(points))[:, None]
     colors = (1 - share) * np.array(START) + share * np.array(GOAL)
-    draw_lines(server, "/trace", [points], [colors], TRACE_WIDTH * reach(arm.robot))
+    draw_lines(server, "/trace", [points], [colors], TRACE_WIDTH * arm.robot.reach)
 
 
 def draw_trees(server: viser.ViserServer, arm: DrawnArm, trees: tuple[Tree, ...]) -> None:
@@ -700,7 +699,7 @@ def draw_trees(server: viser.ViserServer, arm: DrawnArm, trees: tuple[Tree, ...]
     for name, color, tree in zip(TREES, (START, GOAL), trees or (None, None), strict=True):
         edges = [] if tree is None else _edges(arm, tree)
         colors = [np.array(color, float)] * len(edges)
-        draw_lines(server, name, edges, colors, TREE_WIDTH * reach(arm.robot))
+        draw_lines(server, name, edges, colors, TREE_WIDTH * arm.robot.reach)
 
 
 def _edges(arm: DrawnArm, tree: Tree) -> list[Float[ndarray, "points 3"]]:

@@ -33,7 +33,6 @@ from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, Pose
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import known_robots, load_robot
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
-from robotdiffuse.robots.kinematics import link_pose, reach
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
@@ -219,7 +218,7 @@ class Session:
         """Add an obstacle in front of the arm, at half the arm's reach, and return its name."""
         with self._lock:
             check_name("kind of obstacle", kind, NEW_OBSTACLES)
-            length = reach(self.state.problem.robot)
+            length = self.state.problem.robot.reach
             obstacle = NEW_OBSTACLES[kind](length * NEW_POSITION, round(NEW_RADIUS * length, 2))
             self._set_scene([*self.state.obstacles.values(), obstacle])
             return [*self.state.obstacles][-1]
@@ -362,7 +361,7 @@ def _opened(problem: Problem, options: PageOptions) -> State:
         return State(problem, options, goal_pose=poses[0].T_base_frame, goal_frame=poses[0].frame)
     assert isinstance(goal, JointGoal)
     q = goal.positions[0]
-    T = link_pose(robot, q, robot.tip)
+    T = robot.fk(q)
     return State(problem, options, goal_pose=T, goal_frame=robot.tip, goal_configuration=q)
 
 

@@ -19,7 +19,6 @@ from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_about, rotation_from_quaternion, transform
 from robotdiffuse.problems import moveit
 from robotdiffuse.problems.files import ProblemEntry, load_motion_bench_maker, load_problems, problem_record
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.scenes.shapes import Shape
 
@@ -349,7 +348,7 @@ def test_wide_tolerances_of_a_pose_goal_are_noted() -> None:
 @pytest.mark.parametrize("frame", ["panda_hand", "world"])
 def test_objects_are_held_at_the_start(frame: str, tmp_path: Path) -> None:
     bare = asked(tmp_path, request_data()).load()
-    T_base_hand = link_pose(bare.robot, bare.start, "panda_hand")
+    T_base_hand = bare.robot.fk(bare.start, "panda_hand")
     T_hand_rod = transform(np.array([0.0, 0.0, 0.2]))
     T = T_base_hand @ T_hand_rod if frame == "world" else T_hand_rod
     x, y, z, w = np.roll(quaternion_from_rotation(T[:3, :3]), -1).tolist()
