@@ -75,7 +75,7 @@ class Watch:
     def until(
         self, planner: Any = None, shorter_than: float = 0.0
     ) -> Iterator[ob.PlannerTerminationCondition]:
-        """A condition that ends the search when time runs out, or the planner, if one is given, has a path
+        """A condition that ends the search when time runs out, or when `planner`, if given, has a path
         shorter than `shorter_than` [rad]. At the end of the context, a stored exception is raised."""
         self._planner = planner
         self._shorter_than = shorter_than
@@ -298,7 +298,7 @@ class _Search:
         self._robot = context.problem.robot
         self._watch = Watch(context)
         space = start_goal.space(settings.resolution, settings.clearance)
-        # keeps objects that C++ refers to alive until the search is over
+        # C++ refers to these objects, so they must live until the search is over
         self._states = ob.RealVectorStateSpace(self._robot.dof)
         bounds = ob.RealVectorBounds(self._robot.dof)
         for joint in range(self._robot.dof):
@@ -350,8 +350,8 @@ class _Search:
         """Search for a path until time runs out; an anytime planner searches for a path shorter than
         `shorter_than` [rad].
 
-        Returns whether there is a path; it may be as long as before. An exception that was raised in a
-        collision check is raised here.
+        Returns whether there is a path, even if it is no shorter than that of an earlier call. An exception
+        that was raised in a collision check is raised here.
         """
         with self._watch.until(self._watched, shorter_than) as condition:
             self._status = self._planner.solve(condition).asString()

@@ -54,8 +54,8 @@ PLANNING = (
             ("--planner NAME", "see `robotdiffuse planner list` (default: robotdiffuse)"),
             (
                 "--weights FOLDER",
-                "weights of a learned planner: a folder of `robotdiffuse train`, or panda_points, bundled "
-                "weights of a network that gets no clearances (default: those for the robot)",
+                "weights of a learned planner: a folder of `robotdiffuse train`, or panda_points for the "
+                "bundled network that gets no clearances (default: the robot's weights)",
             ),
             (
                 "--set NAME=VALUE *",
@@ -363,8 +363,8 @@ ROBOTS = (
                     ("--out FOLDER", "folder to write (default: one in the user's robots)"),
                     (
                         "--group NAME",
-                        "group of the SRDF, or arm, to plan for; both or all: several arms as one robot "
-                        "(default: the only arm)",
+                        "group of the SRDF, or arm, to plan for; the words both and all stand for several "
+                        "arms as one robot (default: the only arm)",
                     ),
                     ("--base LINK", "first link of the arm (default: the root)"),
                     ("--tip LINK", "last link of the arm (default: the link where a gripper begins)"),
@@ -372,7 +372,7 @@ ROBOTS = (
                     (
                         "--srdf FILE",
                         "SRDF with groups, poses, passive joints and allowed pairs of links (default: the "
-                        "SRDF beside the URDF, without its pairs)",
+                        "SRDF beside the URDF, but its pairs are ignored)",
                     ),
                     (
                         "--allow LINK *",

@@ -13,15 +13,15 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
 MAX_SWEEPS = 5000
-"""Largest number of times that `contacts` certifies the remaining motion."""
+"""Largest number of times that `contacts` checks the remaining motion for the next contact."""
 
 
 def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: float) -> list[Contact]:
     """All contacts along straight lines through waypoints, in order.
 
     A contact begins where two bodies come nearer than `contact` [m] and lasts until they separate. The motion
-    certificate finds the next contact. From there, exact distances are computed every 1 cm of motion until no
-    bodies are in contact.
+    certificate stops at the first place that it cannot prove free: the next contact. From there, exact
+    distances are computed every 1 cm of motion until no bodies are in contact.
     """
     validator = ContinuousCollision(robot, scene, contact, 0.5)
     exact = ExactCollision(robot, scene)

@@ -1,4 +1,4 @@
-"""Tables of the joint values at which two links close to each other along the arm may touch.
+"""Tables of the joint values at which two links may touch that have only one or two joints between them.
 
 The relative pose of two links depends only on the joints between them. For links with one or two joints
 between them, such as forearm and hand, bounding spheres overlap almost always. A table over these joints says
@@ -42,8 +42,9 @@ def build_pair_tables(
     """The rows of `RobotArrays.pairs`, with table and bit filled in for pairs that depend on one or two
     joints, and the tables.
 
-    A table is a row of numbers: index, lower end of the table and cells per unit of the first joint, then of
-    the second joint, then the cells. A cell is the sum of the bits of the pairs that may touch there.
+    A table is a row of numbers. It begins with three numbers for each of its two joints: the joint's index,
+    its value at the first cell, and the number of cells per unit. Then come the cells. A cell is the sum of
+    the bits of the pairs that may touch there.
 
     Args:
         arrays: The RobotArrays without tables.

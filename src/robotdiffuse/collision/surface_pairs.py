@@ -71,8 +71,8 @@ class SurfacePair:
     second: _Body
 
     def distance(self, frames: Float[ndarray, "frames 4 4"], cutoff: float = np.inf) -> float | None:
-        """Distance of the surfaces [m], or some value of at least `cutoff` if it is larger than `cutoff`.
-        None if the surfaces touch, or a piece of one is inside the other."""
+        """Distance of the surfaces [m]; if the distance is larger than `cutoff`, some value of at least
+        `cutoff`. None if the surfaces touch, or a piece of one is inside the other."""
         a = self.first
         b = self.second
         T_a = frames[a.frame]

@@ -15,7 +15,8 @@ MAX_COORDINATE = 1e4
 MIN_SIZE = 1e-9
 """Smallest size [m]. A smaller size must be an error in units: it is far below the 1e-7 m between adjacent
 float32 numbers near 1 m."""
-# Smallest limit of a joint's velocity, acceleration or jerk, and largest value of these rates, in SI units.
+# Bounds on what may be given as velocities, accelerations and jerks of joints, in SI units: limits must be at
+# least MIN_RATE, and no rate may exceed MAX_RATE.
 MIN_RATE = 1e-6
 MAX_RATE = 1e6
 MAX_RPY = 6.3
@@ -224,9 +225,9 @@ def form(array: ndarray | None) -> str:
 
 
 MAX_NUMBERS = 8
-"""`short` shows an array of more numbers than this by its shape."""
+"""If an array has more numbers than this, `short` shows only its shape."""
 MAX_ENTRIES = 3
-"""`short` shows a tuple or list of more entries than this by the number of its entries."""
+"""If a tuple or list has more entries than this, `short` shows only how many it has."""
 MAX_TEXT = 200
 """Longest text that `one_line` returns [characters]."""
 

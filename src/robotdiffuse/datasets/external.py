@@ -221,12 +221,12 @@ def _shared_floor(scenes: Sequence[Scene]) -> Box | None:
 
 
 def export_npz(folder: str | FilePath, file: str | FilePath) -> tuple[int, int]:
-    """Write the motions of all scenes with exactly two spheres and nothing else to a robot.npz, atomically.
+    """Write a robot.npz, atomically, with the motions of all scenes that consist of exactly two spheres.
 
     Returns the number of written motions and the number of motions that were left out.
 
-    Raises InputError if there is no data set, if it has no such scene or not 254 waypoints of 7 joints, and
-    if the file cannot be written.
+    Raises InputError if there is no data set, if it has no such scene, if its motions do not have 254
+    waypoints of 7 joints, or if the file cannot be written.
     """
     file = check_output(file, (".npz",))
     manifest = read_manifest(folder)

@@ -200,11 +200,11 @@ The first four columns are the normalized figures:
 The order of the rows is as printed, except for RRT* and MPiNets, which have equal printed scores. The cause
 of the differences is unknown. These explanations were tried:
 
-- Rounding: four times each printed score has no more than two decimals (1.67, 0.76, 1.67, 2.58, 3.06), so
-  normalized values were probably first rounded to two decimals. Then MPD has 0.645 exactly, MPiNets 0.4150,
-  and MPNet 0.1975, which is 0.19 if truncated. RRT* (0.4475) and RobotDiffuse (0.7750) differ from the
-  printed scores by one digit. So typing errors in RRT*, MPiNets and RobotDiffuse, and a truncated score of
-  MPNet, would explain all differences.
+- Rounding: multiplied by four, each printed score has no more than two decimals (1.67, 0.76, 1.67, 2.58,
+  3.06), so normalized values were probably first rounded to two decimals. Then MPD has 0.645 exactly,
+  MPiNets 0.4150, and MPNet 0.1975, which is 0.19 if truncated. RRT* (0.4475) and RobotDiffuse (0.7750)
+  differ from the printed scores by one digit. So typing errors in three scores (MPiNets, RRT*, RobotDiffuse)
+  and a truncated one (MPNet) would explain all differences.
 - Other normalizations of the columns (fractions of the maximum, logarithms, ranks; all combinations): the
   largest difference is still 0.025 or more.
 - Other weights: with the best weights that sum to 1, the largest difference is 0.011. With (0.2418, 0.1870,

@@ -32,8 +32,7 @@ from robotdiffuse.robots.robot import Robot
 GATES = np.geomspace(0.15, 0.012, 25)
 """For each round of the estimate, the distance beyond which points are too far from the arm to count [m]."""
 MAX_POINTS = 1500
-"""Points of a view are thinned evenly while at least this many remain; so an estimate uses fewer than twice
-this number."""
+"""Every k-th point of a view is used, with the largest k that leaves at least this many."""
 MODEL_CELL = 0.01
 """One point of the arm's surface is used in each cubic cell with this edge [m]."""
 NEIGHBORS = 10

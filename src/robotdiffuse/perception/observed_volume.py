@@ -27,12 +27,12 @@ FREE = 1  # observed as entirely free
 BEHIND = 2  # behind a surface
 SHADOW = 3  # behind the arm
 OUT = 4  # outside the image
-LOST = 5  # on a ray without a return that does not show that nothing is in range
+LOST = 5  # on a ray without a return; something may be in range
 # Depths of pixels without a return. A depth of -d means that nothing is nearer than d to the camera.
 NO_RETURN = np.float32(0.0)
 EMPTY = np.float32(-1e-6)
-"""Depth of a pixel without a return where nothing seems to be in range, in a view that states no range. It
-frees no voxel, but the voxels behind it are HIDDEN, not LOST."""
+"""Depth of a pixel without a return where the camera seems to look into empty space, in a view that states no
+range. It frees no voxel, but the voxels behind it are HIDDEN, not LOST."""
 MAX_DEPTH = np.float32(1e6)
 """Depth of a pixel without an obstacle in range [m]. Minima over pixels also use it for those without a
 return."""
@@ -119,9 +119,9 @@ def usable_image(
     """The view's filtered image, and the arm's spheres in the camera's frame, inflated by the margin [m], by
     noise and by the error of the camera's pose.
 
-    Pixels without a return where nothing seems to be in range are infinite if the view states its range,
-    otherwise EMPTY. Near a surface in the image, they are -d instead of infinite, where d is the surface's
-    depth; see `open_depth`. If their rays meet the arm, they are -NEAREST.
+    If a pixel has no return and the camera seems to look into empty space there, its depth is infinite if the
+    view states its range, otherwise EMPTY. Near a surface in the image it is -d instead of infinite, where d
+    is the surface's depth; see `open_depth`. If its ray meets the arm, it is -NEAREST.
     """
     T = view.T_base_camera
     depth = filtered(view).depth
@@ -222,7 +222,7 @@ def _count_points(depth, arm, intrinsics, T, low, voxel, counts):
     fny = np.float32(ny)
     fnz = np.float32(nz)
     scale = _ONE / voxel
-    # in edges of voxels: o, the camera's position from the grid's lower corner; d, depth
+    # the camera's position (ox, oy, oz), from the grid's lower corner, in units of a voxel's edge
     ox = (T[0, 3] - low[0]) * scale
     oy = (T[1, 3] - low[1]) * scale
     oz = (T[2, 3] - low[2]) * scale
@@ -349,7 +349,8 @@ def _state_of_block(first, intrinsics, T, low, voxel, errors, size, factor, tabl
     # u ± du, v ± dv: a rectangle of pixels that contains the rectangles of all voxels of the block
     error = errors[0] + errors[1] * far
     du, dv = _half_sizes(T, x, y, middle * voxel, error)
-    # at least 1 / (z - ez) of `_carve_block` for each voxel; ez / near: its x and y are not the block's
+    # an upper bound of the 1 / (z - ez) that `_carve_block` uses for a voxel; ez / near is added since the
+    # voxel's x and y differ from the block's
     wider = (_ONE + ez / near) / near
     far = far + error * (_ONE + far / near) + errors[2] * far * far
     u = fx * x + cx
@@ -410,7 +411,7 @@ def _carve_block(
                 if counts[i, j, k] > 0:
                     pixels = fx * fy * (voxel / z) ** 2
                     counts[i, j, k] = max(0, counts[i, j, k] - int(MIN_POINT_FRACTION * pixels))
-                # the image at the voxel's center; `front` becomes the nearest depth if it has no return
+                # the depth at the voxel's center; if there is no return, `front` becomes the nearest depth
                 center_depth = raw[row, column]
                 front = center_depth
                 if front > z + ez or front <= _ZERO:
@@ -482,7 +483,8 @@ ARM_MARGIN = 0.015
 `grown_for_errors`."""
 NARROWED_SHARE = 0.35
 """Free space is narrowed by this fraction of the largest error of a camera's pose. Observed surfaces are
-inflated by the whole error, so narrowing only has to cover what hides right behind an edge."""
+inflated by the whole error. This covers most wrongly free voxels, so narrowing only has to cover those right
+behind an edge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -501,8 +503,8 @@ class ObservedVolume:
     """How far the voxel is behind an observed surface, the minimum over all views [m]; 0 if it is behind
     none, or observed."""
     lost: Bool[ndarray, "56 56 32"]
-    """The voxel is unknown and behind no surface; in some view its ray has no return, and does not show that
-    nothing is in range."""
+    """The voxel is unknown and behind no surface, and in some view its ray has no return, so that something
+    may be in range."""
 
     @cached_property
     def unknown(self) -> Bool[ndarray, "56 56 32"]:

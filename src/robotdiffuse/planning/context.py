@@ -139,8 +139,8 @@ class PlanningContext:
             planner_name: Name of the planner, for the result.
             problem: The problem.
             request: The other arguments of the call.
-            segments: Number of planned paths that the motion joins; timing uses this many times as many
-                intervals as for a single path.
+            segments: Number of planned paths that are joined to one motion. Timing uses so many
+                times the intervals of a single path.
 
         Raises:
             InputError: If `problem` is not a Problem.
@@ -163,8 +163,8 @@ class PlanningContext:
         self._progress: list[tuple[float, float]] = []
         self._refused = ""
         self.refused_at = 0.0, ""
-        """The first violation of the last refused motion: the fraction of the motion before it, and its
-        message."""
+        """The first violation of the last motion that was refused: where it is, as a fraction of the motion,
+        and its message."""
         self._ended: tuple[Status, str] | None = None
         """Status and reason of the result once no path can be finished any more; None before."""
 
@@ -273,8 +273,8 @@ class PlanningContext:
         """End a search that found no path.
 
         Args:
-            reason: Why there is no path, unless the call has `ended`; empty: that time ran out, or that the
-                search ended.
+            reason: Why there is no path; ignored if the call has `ended`. Empty: the result says that
+                time ran out, or that the search ended.
 
         Returns:
             A result with the status and reason that `finish` recorded, if it `ended` the call; else with
@@ -429,8 +429,8 @@ class PlanningContext:
         return ExtraLimits(frame_speeds, self.validator.dynamics)
 
     def _refuse(self, violation: Violation, end: float) -> None:
-        """Record the violation of a refused path or motion. end: value of `violation.time` at its end, which
-        is the last index of a path or the duration of a motion [s]."""
+        """Record the violation of a refused path or motion. end: the value that `violation.time` has at the
+        end of the motion: the last index of a path, or the duration of a motion [s]."""
         self._refused = violation.kind
         self.refused_at = violation.time / end, violation.message
 

@@ -111,9 +111,9 @@ class Planner(ABC, Generic[PlannerSettings]):
 
         Returns:
             The results of the planning calls that `warm_up` makes. The first is without obstacles. If it has
-            a path, two are with a ball that the tip would meet on the straight line in joint space. The last,
-            short one is with the first obstacle of each kind in the problem's scene (one triangle of a mesh,
-            one point of a cloud), or with the whole scene if the problem has views.
+            a path, two more calls have a ball as obstacle, which the tip would meet on the straight line in
+            joint space. The last, short one is with the first obstacle of each kind in the problem's scene
+            (one triangle of a mesh, one point of a cloud), or with the whole scene if the problem has views.
         """
         from robotdiffuse.collision.exact_meshes import warm_up as load_coal
 
@@ -233,9 +233,9 @@ class CheckedSettings(Settings):
 
 
 def ever_finer(context: PlanningContext, settings: PlannerSettings) -> Iterator[tuple[PlannerSettings, int]]:
-    """Yields settings and the number of the attempt, from 0, until time runs out. Each attempt has a finer
-    resolution of collision checks, down to FINEST_RESOLUTION, for searches whose last path the validator
-    refused."""
+    """Yields settings and the number of the attempt, from 0, until time runs out. For searches that are
+    repeated when the validator refuses their path: each attempt checks collisions at a finer resolution, down
+    to FINEST_RESOLUTION."""
     attempt = 0
     while attempt == 0 or context.remaining > 0:
         yield settings, attempt

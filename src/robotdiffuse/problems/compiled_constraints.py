@@ -185,8 +185,8 @@ class PathConstraints:
         """
         q = for_kernels(q)
         rows = self.rows
-        # how much a row's value can change if each joint deviates by `chord`; the interpolated orientation of
-        # a TURN changes with the position along its segment
+        # how much a row's value can change if each joint deviates by `chord`; a TURN's desired orientation
+        # depends on the position along the line, so it changes too
         own_change = np.where(rows.row_kind == DISTANCE, rows.lever_bounds.sum(axis=1), rows.chain_length)
         turning = (rows.row_kind == TURN) * np.linalg.norm(rows.a, axis=1) * np.linalg.norm(rows.b, axis=1)
         slack = chord * (own_change + turning * rows.lever_bounds.sum(axis=1))
@@ -207,8 +207,9 @@ class PathConstraints:
         motion.
 
         A partial derivative of a frame's position by several joints is at most as long as the lever of the
-        last of these joints in the chain. The products of joint rates with j as their last joint sum up to
-        the product of the sums over the joints up to j, less the product of the sums up to j - 1.
+        last of these joints in the chain. So the levers multiply sums of products of joint rates. The sum of
+        all products whose last joint is j is P(j) - P(j - 1), where P(j) is the product of the rates' sums
+        over the joints up to j.
 
         derivatives: bounds on the first three derivatives of the joint positions, for each piece.
         """
@@ -283,7 +284,8 @@ def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
     total_angle = float(np.linalg.norm(turn))
     if length < MIN_LINE_LENGTH and total_angle > 0:
         # The link turns in place. Two cones express this: the axis of the turn keeps its direction, and a
-        # vector perpendicular to it stays within half the total angle of its direction in mid-turn.
+        # vector perpendicular to the axis deviates from its direction in mid-turn by at most half the total
+        # angle.
         axis = turn / total_angle
         across = rotation_z_to(axis)[:, 0]
         middle = rotation_about(axis, total_angle / 2) @ across

@@ -45,8 +45,8 @@ class RigidShape(Protocol):
     def name(self) -> str: ...
 
     def solid(self) -> tuple[Pose, tuple[ConvexMesh, ...]]:
-        """The shape's pose in the frame in which it is given, and convex meshes in the shape's own frame that
-        together contain the shape."""
+        """The pose of the shape's own frame, and convex meshes in this frame that together contain the
+        shape."""
         ...
 
 

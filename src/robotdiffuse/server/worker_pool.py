@@ -23,7 +23,7 @@ INITIAL_REQUEST_SECONDS = 0.5
 STOPPING = "the server is stopping"
 GAUGES = {
     "workers": "Worker processes.",
-    "workers_ready": "Workers that are prepared, idle or busy.",
+    "workers_ready": "Workers that are prepared, whether idle or busy.",
     "workers_busy": "Workers that answer a request.",
     "requests_waiting": "Requests that wait for a worker.",
 }
@@ -118,7 +118,8 @@ class WorkerPool:
         return answer
 
     def _count_worker(self, call: Future[Answer]) -> None:
-        """Count the call's worker if it was lost or is renewed. The thread that ends the call calls this."""
+        """Count the request's worker if it was lost or is renewed. Runs in the thread in which the request
+        ends."""
         if call.cancelled():
             return
         if isinstance(call.exception(), EndedError):
@@ -138,7 +139,7 @@ class WorkerPool:
 
     @property
     def ready(self) -> int:
-        """Number of workers that are prepared, idle or busy."""
+        """Number of workers that are prepared, whether idle or busy."""
         return sum(worker.ready for worker in self._workers.workers)
 
     def state(self) -> dict[str, int]:

@@ -116,7 +116,7 @@ def time_parameterize(
     deviations = _shrunk(waypoints, allowed[1:-1], keeps, MIN_DEVIATION)
     while start_speed and deviations[:1].any():
         stop = np.append(np.flatnonzero(deviations == 0), len(deviations))[0]
-        try:  # whether the motion can pass the corners up to its first stop at its start speed
+        try:  # can the motion, which has its start speed, pass the corners before its first stop?
             _time_segments(robot, path, waypoints[: stop + 2], deviations[:stop], settings, start_speed)
             break
         except TooFastError:
@@ -187,8 +187,8 @@ def _check_limits(robot: Robot) -> None:
 
 
 def _distinct(positions: Configurations) -> Int[ndarray, "m"]:
-    """Indices of the first row and of every row that differs from the last returned one; in place of the last
-    of these rows, the last row of all. Only one index if all rows are equal."""
+    """Indices of the rows without repetitions: the first row, and each row that differs from the one returned
+    before it. The last index is replaced by that of the last row. Only one index if all rows are equal."""
     if (np.linalg.norm(positions[1:] - positions[:-1], axis=1) > SAME_WAYPOINT_DISTANCE).all():
         return np.arange(len(positions))
     distinct = [0]
@@ -236,7 +236,7 @@ PATH_PARTS = 8
 """Number of parts of about equal length into which `StopGraph` divides a path. With more parts, planning
 takes longer and gains little."""
 SPEED_FACTORS = (1.0, 0.5)
-"""Fractions of the highest speed at which `StopGraph` has each motion."""
+"""`StopGraph` has each motion at these fractions of its highest speed."""
 MIN_DISTANCE = 1e-3
 """A stop that divides the path is left out if it is closer than this to another stop [rad]."""
 
@@ -316,9 +316,9 @@ class StopGraph:
         return motions
 
     def sample(self, radii: JointValues, travel: float) -> tuple[Values, Configurations]:
-        """Values of s, including all stops, and the configurations there [n, dof]. Between
-        neighboring stops, the values are equally spaced, so that on average no point of the arm moves further
-        than `travel` [m] from one configuration to the next. radii: from `motion_radii`."""
+        """Values of s, including all stops, and the configurations there [n, dof]. Between neighboring stops,
+        the values are equally spaced. Their number is such that the steps of any point of the arm have a mean
+        length of at most `travel` [m]. radii: from `motion_radii`."""
         parts = []
         for low, high in zip(self.stops[:-1], self.stops[1:], strict=True):
             samples = self.line(np.linspace(low, high, 33), 0)

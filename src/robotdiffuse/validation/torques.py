@@ -22,7 +22,7 @@ RESOLUTION = 1e-3
 still exceed its limit then, it counts as exceeding it."""
 MAX_OPEN_PIECES = 100_000
 """Maximum number of pieces that are halved at once. If there are more, as in motions with very many turns,
-their values that are not proved to be within the limits count as exceeding them."""
+each value that is not proved to be within its limit counts as exceeding it."""
 PLACE_RESOLUTION = 1 / 64
 """Resolution of the place where a value first exceeds its limit, as a fraction of a step from row to row."""
 States = tuple[JointRows, JointRows, JointRows]
@@ -49,8 +49,8 @@ class Excess(NamedTuple):
     value: float
     """The torque of the joint [N m] or [N], or the speed of the frame [m/s]."""
     excess: float
-    """Largest excess of this joint or frame along the motion, in the unit of `value`, over its limit with the
-    allowed slack."""
+    """By how much the joint or frame exceeds its limit and the allowed slack, at most along the motion, in
+    the unit of `value`."""
 
 
 def trajectory_pieces(trajectory: Trajectory) -> Pieces:

@@ -2,10 +2,10 @@
 
 A plane that separates two convex bodies proves that they do not touch, no matter how the plane was found.
 The algorithm of Gilbert, Johnson and Keerthi (GJK, 1988) finds the best plane for the poses in the middle of
-the motion, starting from the plane of the previous motion. The bound is the smallest gap along the plane's
-normal, during the motion, between the vertices of one body and the other body.
-Each vertex moves from its position in the middle by t v + r with t in [-1, 1], where v is the vertex's
-velocity and r a small remainder of second order (see `lane_clearance.py`). All computations are in float64.
+the motion, starting from the plane of the previous motion. The bound is the smallest gap between the two
+bodies' vertices along the plane's normal during the motion. Each vertex moves from its position in the middle
+by t v + r with t in [-1, 1], where v is the vertex's velocity and r a small remainder of second order (see
+`lane_clearance.py`). All computations are in float64.
 """
 
 from typing import NamedTuple
@@ -121,7 +121,8 @@ def pose(offsets, parents, slides, q, dq, posture):
 @inner_kernel()
 def relative_twist(posture, frame, reference):
     """The motion of one frame relative to the frame `reference`: its angular velocity, and the velocity of
-    its point at the origin of the robot's base frame, in which all vectors are."""
+    the point of the frame that is at the origin of the robot's base frame. All vectors are in the base
+    frame."""
     twist = posture.twists[frame]
     reference_twist = posture.twists[reference]
     return minus(twist, reference_twist), minus(twist[3:], reference_twist[3:])
@@ -216,8 +217,8 @@ def separation(hulls, p, solids, other, reference, posture):
 
     Returns the gap in the middle of the motion, and the smallest gap along the motion. The smallest gap
     leaves out the remainder r (see the module's docstring) and uses velocities relative to frame `reference`.
-    `other` is the index of an obstacle or, if negative, -1 minus the index of a part. If this part is not
-    fixed to frame `reference`, its motion is included.
+    `other` is the index of an obstacle or, if negative, -1 minus the index of a part. If part `other` is not
+    fixed to frame `reference`, the smallest gap includes its motion too.
     """
     n = posture.points[0]
     frame = hulls.frame[p]

@@ -35,7 +35,7 @@ _INTEGERS = ir.VectorType(ir.IntType(32), W)
 _FIRST_TO_ALL = ir.Constant(_INTEGERS, [0] * W)
 # Alignment that loads, stores and gathers rely on [bytes]: that of one float32
 _ALIGN = 4
-# Any, since callers of intrinsics omit the first argument, the context
+# typed as Any, since callers of intrinsics omit the first argument, the context
 _operation: Any = intrinsic
 
 

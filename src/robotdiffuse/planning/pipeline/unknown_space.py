@@ -49,9 +49,10 @@ from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import OCCUPIED, OPTIMISTIC, PADDED, PREDICTED, JointGoal, Problem
 from robotdiffuse.scenes.point_cloud import voxel_thin
 
-# Under an assumption, at most MAX_FIRST_MOTIONS first motions are planned. The risk of a motion is the sum of
-# the predicted probabilities of all unknown voxels that it sweeps. No more first motions are planned once the
-# lowest risk is at most NEGLIGIBLE_RISK, or, after MIN_FIRST_MOTIONS motions, at most ACCEPTABLE_RISK.
+# Under an assumption, up to MAX_FIRST_MOTIONS motions are planned, each until the first one is found. The
+# risk of a motion is the sum of the predicted probabilities of all unknown voxels that it sweeps. No more of
+# them are planned once the lowest risk is at most NEGLIGIBLE_RISK, or, after MIN_FIRST_MOTIONS motions, at
+# most ACCEPTABLE_RISK.
 MAX_FIRST_MOTIONS = 8
 MIN_FIRST_MOTIONS = 4
 ACCEPTABLE_RISK = 2.0
@@ -89,8 +90,8 @@ def plan_with_unknown_space(
     predicted: the probability that each fine voxel of the observed volume is occupied; None: the occupancy
     completion network predicts it if the policy needs it. unknown: the space that no view saw; None: computed
     from the problem's views. A caller that has put the observed points into the scene, as `Explorer` does,
-    may give it under the policy padded, or under predicted with `predicted`; then no volume is computed from
-    the views.
+    may give `unknown`, and then no volume is computed from the views; under the policy predicted it must also
+    give the argument `predicted`.
 
     The result states the assumption, the confidence (the probability that the motion is free in the true
     scene), and the unknown space that the motion crosses.
@@ -230,8 +231,8 @@ def predicted_obstacles(problem: Problem) -> AssumedPoints:
 
 
 def _goals(context: PlanningContext, as_seen: Problem) -> Configurations | PlanResult:
-    """The goal configurations: those of a JointGoal, or for poses those that are free of observed obstacles.
-    A failed result if there are none."""
+    """The goal configurations: those of a JointGoal, or those that reach the goal's pose and are free of
+    observed obstacles. A failed result if there are none."""
     if isinstance(as_seen.goal, JointGoal):
         return as_seen.goal.positions
     start_goal = usable_start_goal(PlanningContext(context.planner_name, as_seen, context.request))
@@ -262,8 +263,8 @@ class _Attempts:
     space as free."""
 
     def best(self, problem: Problem, assumption: str, end: float) -> PlanResult:
-        """A motion found before `end` [s since the call] or in the minimum time, or the result that says why
-        there is none.
+        """A motion that is found before `end` [s since the call], or the result that says why there is none.
+        Each planning call has at least a minimum time, even after `end`.
 
         With predicted probabilities, several first motions are planned, and then one that is improved for the
         remaining time. Among those with about the highest confidence, the shortest is returned.
