@@ -16,7 +16,7 @@ from robotdiffuse.problems.families import family as drawing
 from robotdiffuse.problems.families.family import CONFIGURATION, POSE, POSITION
 from robotdiffuse.problems.families.rop import ROP, Rop
 from robotdiffuse.problems.families.scaled import ScaledFamily, family_for, scale_for
-from robotdiffuse.robots.robot import scaled
+from robotdiffuse.robots.robot import LinkPairTable, scaled
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.surface_points import VisibleRegion, sample_surface
 
@@ -81,6 +81,13 @@ def test_a_scaled_arm_reaches_so_many_times_as_far_and_touches_itself_at_the_sam
     one, other = (CollisionChecker(arm, scene) for arm, scene in ((robot, EMPTY), (large, EMPTY)))
     expected = np.minimum(1.5 * one.pair_clearances(q), 1.0)  # distances are capped at a meter
     np.testing.assert_allclose(other.pair_clearances(q), expected, atol=1e-5)
+
+
+def test_a_scaled_arm_looks_up_positions_of_prismatic_joints_in_a_scaled_table() -> None:
+    table = LinkPairTable(("panda_hand", "panda_leftfinger"), ("panda_finger_joint1",), (0.0,), (0.04,), np.arange(8) < 3)
+    (large,) = scaled(replace(load_robot("panda"), tables=(table,)), 1.5).tables
+    positions = np.linspace(-0.01, 0.05, 50)
+    np.testing.assert_array_equal(large.at(1.5 * positions), table.at(positions))
 
 
 @pytest.mark.parametrize("name", FAMILIES)

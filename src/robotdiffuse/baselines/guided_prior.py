@@ -175,7 +175,7 @@ class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
         closest = min(colliding, key=lambda attempt: attempt[:2], default=None)
         result = None if closest is None else context.finish(start_goal.complete(closest.path), self.name)
         return result or context.unsolved(
-            f"none of {batches * samples} samples of the network is free of collision"
+            f"none of {batches * samples} samples of the network is valid"
             if batches
             else f"time ran out before the first {samples} samples were complete; use a longer time limit"
         )

@@ -75,7 +75,7 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
                     best = motion
         # the validator checks the meshes, which are smaller than the covering spheres: the best motion may be
         # valid after all
-        outcome = "reached the goal, but not free of collision" if best.arrived else "did not reach the goal"
+        outcome = "reached the goal, but is not valid" if best.arrived else "did not reach the goal"
         return context.finish(best.path(start_goal), "policy") or context.unsolved(
             f"{roll_outs} roll-outs of the policy, the best of which {outcome}"
         )

@@ -98,7 +98,7 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
                 best = candidate
         result = None if best is None else context.finish(start_goal.complete(best.path), self.name)
         return result or context.unsolved(
-            f"no path of the network was free in {context.elapsed:.2f} s and {rounds} rounds of "
+            f"no path of the network was valid in {context.elapsed:.2f} s and {rounds} rounds of "
             f"{settings.attempts} attempts; a longer time limit or hybrid replanning may find one"
         )
 

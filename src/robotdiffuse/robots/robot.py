@@ -516,16 +516,21 @@ def _with_body(robot: Robot, body: AttachedBody) -> Robot:
 
 
 def scaled(robot: Robot, scale: float) -> Robot:
-    """The arm without attached bodies, scaled by a factor: joint offsets, position limits and locked values
-    of prismatic joints, spheres, convex meshes and `above`. All else is unchanged, including inertias, named
-    poses and surfaces."""
+    """The arm without attached bodies, scaled by a factor: joint offsets, spheres, convex meshes, `above`,
+    and all positions of prismatic joints (limits, locked values, tables). All else is unchanged, including
+    inertias, named poses and surfaces."""
     arm = robot.arm
-    prismatic = {joint.name for joint in arm.joints if joint.kind == "prismatic"}
+    factors = {joint.name: scale if joint.kind == "prismatic" else 1.0 for joint in arm.joints}
 
     def sized(joint: Joint) -> Joint:
-        by = scale if joint.name in prismatic else 1.0
-        limits = {name: by * getattr(joint, name) for name in ("lower", "upper")}
+        limits = {name: factors[joint.name] * getattr(joint, name) for name in ("lower", "upper")}
         return replace(joint, T_parent_joint=_with_scaled_position(joint.T_parent_joint, scale), **limits)
+
+    def sized_table(table: LinkPairTable) -> LinkPairTable:
+        by = np.array([factors[name] for name in table.joints])
+        lower = tuple((by * table.lower).tolist())
+        upper = tuple((by * table.upper).tolist())
+        return replace(table, lower=lower, upper=upper)
 
     return replace(
         arm,
@@ -535,7 +540,8 @@ def scaled(robot: Robot, scale: float) -> Robot:
             link: tuple(replace(mesh, vertices=scale * mesh.vertices) for mesh in meshes)
             for link, meshes in arm.meshes.items()
         },
-        locked={name: (scale if name in prismatic else 1.0) * value for name, value in arm.locked.items()},
+        locked={name: factors[name] * value for name, value in arm.locked.items()},
+        tables=tuple(map(sized_table, arm.tables)),
         above={link: _with_scaled_position(T, scale) for link, T in arm.above.items()},
     )
 
