@@ -312,6 +312,15 @@ def test_the_command_writes_everything(small, tmp_path, said: Said):
         assert ElementTree.parse(out / name).getroot().tag.endswith("svg")
 
 
+@pytest.mark.slow
+def test_a_folder_that_does_not_exist_is_made_for_replays_too(small: Path, tmp_path: Path, said: Said) -> None:
+    pytest.importorskip("matplotlib")
+    keep_problems(small, ["rop/0"])
+    said(0, "bench", "report", small, "--out", tmp_path / "new" / "report")
+    names = {file.name for file in (tmp_path / "new" / "report").iterdir()}
+    assert {"index.html", "replays.html", "report.md"} < names
+
+
 def test_no_legend_or_name_is_clipped() -> None:
     """Regression: names of planners with settings were cut off at the edge of a plot."""
     pytest.importorskip("matplotlib")

@@ -6,6 +6,7 @@ Comments before a block, which pages do not show, say more about it:
     <!-- needs: NAME -->   one of PREPARED is put into the folder first
     <!-- test: run -->     commands are run, not only looked at
     <!-- test: parse -->   Python is compiled, not run
+    <!-- test: unsolved -->   it shows a problem that cannot be solved; the results of all other blocks must be solved
 
 A language that TRIED lacks is an error, so that no block goes untested in silence.
 """
@@ -27,6 +28,7 @@ import yaml
 
 from helpers.quick_preparation import QUICK, coarse_grids
 from robotdiffuse.cli import build_parser, main
+from robotdiffuse.core.results import PlanResult
 from robotdiffuse.problems.files import load_problem
 from robotdiffuse.robots.fitting.preparation import add_robot
 
@@ -146,8 +148,12 @@ class Notebook:
 def _python(page: Notebook, block: Block) -> None:
     if "file" in block.marks or block.marks.get("test") == "parse":
         compile(block.code, block.where, "exec")
-    else:
-        exec(compile("\n" * (block.line - 1) + block.code, block.where, "exec"), page.names)
+        return
+    before = dict(page.names)
+    exec(compile("\n" * (block.line - 1) + block.code, block.where, "exec"), page.names)
+    made = [value for name, value in page.names.items() if value is not before.get(name)]
+    unsolved = [value for value in made if isinstance(value, PlanResult) and not value.solved]
+    assert bool(unsolved) == (block.marks.get("test") == "unsolved"), unsolved
 
 
 def _yaml(page: Notebook, block: Block) -> None:

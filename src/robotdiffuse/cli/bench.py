@@ -13,8 +13,9 @@ from robotdiffuse.core.tables import Table, show
 from robotdiffuse.core.types import Path as Waypoints
 from robotdiffuse.evaluation import paper
 from robotdiffuse.evaluation.bench import BenchSettings, preset_settings, run_bench
-from robotdiffuse.evaluation.bench_comparisons import Bench, Section, read_bench, sections
+from robotdiffuse.evaluation.bench_comparisons import Bench, read_bench, sections
 from robotdiffuse.evaluation.bench_report import (
+    Replay,
     about,
     bench_report,
     main_table,
@@ -70,10 +71,13 @@ def run_report(arguments: Namespace) -> None:
     bench = read_bench(Path(arguments.folder), arguments.planners)
     parts = sections(bench, arguments.limits)
     out = Path(arguments.out or arguments.folder)
-    replays = None if arguments.no_replays else _write_replays(bench, parts, out / "replays.html")
+    motions = [] if arguments.no_replays else motions_to_replay(bench, parts)
+    replays = "replays.html" if motions else None
     report = bench_report(bench, parts, replays)
     report.write(out / "report.md")
     write_atomically(out / "index.html", report.page)
+    if replays:
+        _write_replays(motions, out / replays)
     for section in parts:
         show(main_table(section, section.main, bench.reference))
         print(missing_line(section.main), end="\n\n" if section.main.missing else "\n")
@@ -81,12 +85,8 @@ def run_report(arguments: Namespace) -> None:
     print(f"wrote {', '.join(str(out / name) for name in files)} and {len(report.plots)} plots as .svg")
 
 
-def _write_replays(bench: Bench, parts: list[Section], file: Path) -> str | None:
-    """Writes the motions of the first motion's robot. Returns the file's name; None if there is no motion to
-    replay."""
-    motions = motions_to_replay(bench, parts)
-    if not motions:
-        return None
+def _write_replays(motions: list[Replay], file: Path) -> None:
+    """Writes the motions of the first motion's robot."""
     robot = motions[0].case.problem.robot
     entries = [
         GalleryEntry(
@@ -96,7 +96,6 @@ def _write_replays(bench: Bench, parts: list[Section], file: Path) -> str | None
         if (problem := motion.case.problem).robot.name == robot.name
     ]
     write_gallery(robot, entries, file, "Motions")
-    return file.name
 
 
 def run_confirm(arguments: Namespace) -> int:

@@ -108,6 +108,28 @@ def check_output(file: str | Path, endings: tuple[str, ...], *inputs: str | None
     return path
 
 
+def append_line(file: Path, line: str, make_folder: bool = False) -> None:
+    """Append a line to `file` and flush it to the disk. `make_folder` as for `write_atomically`.
+
+    If writing fails, an existing `file` keeps its content. Raises InputError as `write_atomically` does.
+    """
+    try:
+        if make_folder:
+            file.parent.mkdir(parents=True, exist_ok=True)
+        with file.open("ab", buffering=0) as stream:
+            size = stream.seek(0, os.SEEK_END)
+            unwritten = memoryview(f"{line}\n".encode())
+            try:
+                while unwritten:
+                    unwritten = unwritten[stream.write(unwritten) :]
+                os.fsync(stream.fileno())
+            except BaseException:
+                stream.truncate(size)
+                raise
+    except OSError as error:
+        raise write_error(file, error) from None
+
+
 class JsonLines:
     """A file of JSON objects, one per line. `append` returns once the row is on disk. If `file` is None, rows
     are kept in memory only."""
@@ -141,28 +163,13 @@ class JsonLines:
     def append(self, row: dict[str, Any]) -> None:
         """Add a row and flush it to the disk. If writing fails, the row is in neither the file nor `rows`."""
         if self._file is not None:
-            self._write(self._file, json.dumps(row) + "\n")
+            if self._without_cut_line is not None:
+                # The incomplete line is removed only now: at reading, another process could still be writing
+                # it.
+                write_atomically(self._file, self._without_cut_line)
+                self._without_cut_line = None
+            append_line(self._file, json.dumps(row), make_folder=True)
         self.rows.append(row)
-
-    def _write(self, file: Path, line: str) -> None:
-        if self._without_cut_line is not None:
-            # The incomplete line is removed only now: at reading, another process could still be writing it.
-            write_atomically(file, self._without_cut_line)
-            self._without_cut_line = None
-        try:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            with file.open("ab", buffering=0) as stream:
-                size = stream.seek(0, os.SEEK_END)
-                unwritten = memoryview(line.encode())
-                try:
-                    while unwritten:
-                        unwritten = unwritten[stream.write(unwritten) :]
-                    os.fsync(stream.fileno())
-                except BaseException:
-                    stream.truncate(size)
-                    raise
-        except OSError as error:
-            raise write_error(file, error) from None
 
 
 @contextmanager

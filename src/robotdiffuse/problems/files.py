@@ -22,7 +22,7 @@ from robotdiffuse.core.input_files import (
     read_text,
     read_yaml,
 )
-from robotdiffuse.core.output_files import write_atomically, write_error
+from robotdiffuse.core.output_files import append_line, write_atomically
 from robotdiffuse.core.settings import Number, converted
 from robotdiffuse.core.transforms import pose_entry
 from robotdiffuse.problems.fields import (
@@ -197,14 +197,8 @@ def save_problem(problem: Problem, file: str | Path, robot: str | None = None) -
     file = file_name(file, "problem file")
     ending = known_ending(file, "problem file", WRITERS)
     text = WRITERS[ending](problem_record(problem, file.parent, robot))
-    if ending != ".jsonl":
-        write_atomically(file, text)
-        return
-    try:
-        with file.open("a", encoding="utf-8") as stream:
-            stream.write(text + "\n")
-    except OSError as error:
-        raise write_error(file, error) from None
+    write = append_line if ending == ".jsonl" else write_atomically
+    write(file, text)
 
 
 def _yaml(data: dict[str, object]) -> str:

@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 
 import robotdiffuse as rd
 from helpers.commands import written
+from helpers.full_disk import full_disk
 from helpers.panda import PANDA
 from helpers.refusals import refuses
+from robotdiffuse.core.errors import OutputError
 from robotdiffuse.core.transforms import rotation_about, rotation_from_rpy, transform
 from robotdiffuse.problems.files import load_problems, problem_from_record, problem_record, save_problem
 from robotdiffuse.robots.kinematic_tree import Joint
@@ -206,6 +208,17 @@ def test_lines_are_appended(tmp_path: Path) -> None:
         save_problem(full_problem([0.1 * i, *READY[1:]]), tmp_path / "many.jsonl")
     goals = [entry.load().goal for entry in load_problems(tmp_path / "many.jsonl")]
     assert [goal.positions[0, 0] for goal in goals if isinstance(goal, rd.JointGoal)] == [0, 0.1, 0.2]
+
+
+def test_a_line_that_the_disk_has_no_room_for_leaves_the_file_as_it_was(tmp_path: Path) -> None:
+    file = tmp_path / "many.jsonl"
+    save_problem(full_problem(None), file)
+    size = file.stat().st_size
+    with full_disk(size + 100), pytest.raises(OutputError, match=r"many\.jsonl cannot be written: File too large$"):
+        save_problem(full_problem(None), file)
+    assert file.stat().st_size == size
+    save_problem(full_problem(None), file)
+    assert len(load_problems(file)) == 2
 
 
 def test_places_that_cannot_be_written_to(tmp_path: Path) -> None:
