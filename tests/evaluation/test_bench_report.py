@@ -301,6 +301,7 @@ def test_the_command_writes_everything(small, tmp_path, said: Said):
     printed = said(0, "bench", "report", small, "--out", out, "--limits", "1,10", "--no-replays")
     assert "rop, non-trivial, 10 s: 3 problems" in printed and "ompl_rrt_star" in printed
     page = (out / "index.html").read_text()
+    assert bench_report.UNEQUAL_NOTE in page and "`" not in page
     for name in ("robotdiffuse", "mpnet", "ompl_rrt_star"):
         assert page.count(f">{name}<") >= 4, name
     assert "http" not in re.sub(r'xmlns(:\w+)?="[^"]*"|<metadata>.*?</metadata>', "", page, flags=re.DOTALL)

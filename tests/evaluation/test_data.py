@@ -16,6 +16,7 @@ from robotdiffuse.datasets.rows import motion_of, problem_of
 from robotdiffuse.datasets.shards import pick_rows, read_shard, shard_path, write_shard
 from robotdiffuse.evaluation import data_report
 from robotdiffuse.evaluation.checks import check_data
+from robotdiffuse.evaluation.report import histograms
 
 ARM = box_arm()
 BALL = rd.Scene([rd.Sphere([0.0, 0.9, 0.0], 0.1)])
@@ -242,6 +243,14 @@ def test_page(tmp_path, rows):
     before = file.read_bytes()
     data_report.write_page(data, file, ARM)
     assert file.read_bytes() == before
+
+
+def test_ticks_of_histograms_say_where_they_are() -> None:
+    """Regression: 2.5, 7.5 and 12.5 % were labelled 2, 8 and 12 %."""
+    pytest.importorskip("matplotlib")
+    svg = histograms({"length": (np.arange(8.0), {"a": np.arange(7.0)})}, across=1)
+    ticks = [float(text) for text in re.findall(r">([\d.]+)%<", svg)]
+    assert np.allclose(np.diff(ticks), 2.5), "the example has ticks between whole percents"
 
 
 def test_page_of_hardly_any_motions(tmp_path, rows):

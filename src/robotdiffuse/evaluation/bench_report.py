@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 
 UNEQUAL = " †"
 UNEQUAL_NOTE = (
-    "† not at equal time: this planner or the reference ended before the limit. `bench run --equal-time` "
-    "repeats such calls until the limit."
+    "† not at equal time: this planner or the reference ended before the limit. The option "
+    "--equal-time of bench run repeats such calls until the limit."
 )
 NOTES = """\
 - A call counts in a table if its limit was at least the table's, or if it ended by itself before its limit,

@@ -187,11 +187,11 @@ def histograms(panels: Histograms, across: int) -> str:
             axes.set_axis_off()
         for axes, (label, (bins, parts)) in zip(grid.flat, panels.items(), strict=False):
             for name, values in parts.items():
-                weights = np.full(len(values), 1 / max(len(values), 1))
+                weights = np.full(len(values), 100 / max(len(values), 1))
                 inside = values.clip(bins[0], bins[-1])
                 axes.hist(inside, bins, weights=weights, histtype="step", label=name)
             axes.set_xlabel(label)
-            axes.yaxis.set_major_formatter("{x:.0%}")
+            axes.yaxis.set_major_formatter("{x:g}%")
         figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=5)
 
     return draw_plot(fill, 12.7, PANEL_HEIGHT * down)
