@@ -44,6 +44,21 @@ def test_the_papers_method_has_a_row_only_with_weights_that_see_the_code_alone(t
     refuses(r"single sample takes about .* denoising steps", paper.run_table1, too_fast, lambda _: None, lambda *_: None)
     assert not list(tmp_path.iterdir())
     assert paper.NO_WEIGHTS in paper.notes(paper.Table1Settings(tmp_path))
+    assert not {*"*`"} & {*paper.NO_WEIGHTS}, "notes are plain text"
+
+
+def test_workers_and_a_cluster_are_refused_together(tmp_path: Path, said: Said) -> None:
+    for part in ("table1", "figures"):
+        options = ("--out", tmp_path / "out", "--workers", "2", "--cluster", "ray")
+        assert "--workers cannot be combined with --cluster" in said(2, "reproduce", part, *options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_of_table_2_names_the_family() -> None:
+    settings = ablation.AblationSettings(data="rop", out="out", family="shelf", problems=1)
+    half = ablation.Evaluation(*(np.full(1, 0.5) for _ in range(5)))
+    page = ablation.table2(settings, [ablation.RowResult("Ours", half, half, (0.5,))])
+    assert "--problems 1 --family shelf --seeds 1\n" in page.markdown
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,6 @@ def _say(text: str) -> None:
 
 def _bench_settings(arguments: Namespace) -> list[BenchSettings]:
     """The settings of each run of the bench: those of the preset, or a single one from the options."""
-    check_workers(arguments)
     changes = _changes(arguments, BenchSettings)
     if arguments.preset:
         fixed = ("planners", "time_limit", "seeds", "equal_time")
@@ -63,6 +62,7 @@ def _bench_settings(arguments: Namespace) -> list[BenchSettings]:
 def _changes(arguments: Namespace, settings: Any) -> dict[str, Any]:
     """The settings that the command's options set. By default, there is one worker process for every two
     cores."""
+    check_workers(arguments)
     options = chosen(arguments, settings.__dataclass_fields__)
     return {"workers": HALF_OF_CORES} | options | {"out": Path(arguments.out)}
 

@@ -313,7 +313,7 @@ def table2(settings: AblationSettings, results: list[RowResult]) -> Report:
     command = (
         f"robotdiffuse reproduce table2 --data DATA --out FOLDER --samples {settings.samples} "
         f"--encoder-samples {settings.encoder_samples} --problems {settings.problems} "
-        f"--seeds {settings.seeds}"
+        f"--family {settings.family} --seeds {settings.seeds}"
     )
     report = paper_report("Table 2", command)
     report.table(table(settings, results), level=2)

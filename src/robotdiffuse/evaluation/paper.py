@@ -161,7 +161,7 @@ ONE_SAMPLE = ("samples=1", "guidance_steps=0", "repeat=false")
 """Planner settings for a single sample without collision guidance, as in the row JPC of the paper's Table 2
 (losses of joints, points and collision)."""
 NO_WEIGHTS = (
-    f"The row *{AS_IN_PAPER}* is missing, since --paper-weights is not given. No weights of the paper's size "
+    f"The row {AS_IN_PAPER!r} is missing, since --paper-weights is not given. No weights of the paper's size "
     "are bundled: train them (robotdiffuse train planner --config paper --data FOLDER --encoder FOLDER --out "
     "FOLDER) and give their folder."
 )
