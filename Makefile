@@ -13,21 +13,23 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: install demo test test-all lint docs gallery bench weights baselines chromium clean
+.PHONY: install demo test test-all lint docs gallery bench weights baselines chromium compiled clean
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
 
-# uv takes a tenth of pip's time; where it cannot install, as from a mirror that only pip knows, pip does. Extras are left to
+# uv takes a fraction of pip's time; where it cannot install, as from a mirror that only pip knows, pip does. PyTorch is left to
 # pip: many machines configure for it where PyTorch without CUDA comes from.
+PIP := $(BIN)/python -m pip install -q -c constraints.txt
+UV := $(BIN)/uv pip install -q --python $(BIN)/python -c constraints.txt
+
 .venv/core.stamp: pyproject.toml constraints.txt | .venv/bin/python
-	$(BIN)/python -m pip install -q -c constraints.txt uv && \
-		$(BIN)/uv pip install -q --python $(BIN)/python -c constraints.txt -e . || \
-		{ echo "uv could not install; now pip"; $(BIN)/python -m pip install -q -c constraints.txt -e .; }
+	$(PIP) uv && $(UV) -e . || { echo "uv could not install; now pip"; $(PIP) -e .; }
 	touch $@
 
+# the tests start hundreds of processes, each of which would compile what it imports
 .venv/dev.stamp: pyproject.toml constraints.txt | .venv/bin/python
-	$(BIN)/python -m pip install -q -c constraints.txt -e ".[dev]"
+	$(PIP) uv torch && $(UV) --compile-bytecode -e ".[dev]" || { echo "uv could not install; now pip"; $(PIP) -e ".[dev]"; }
 	touch .venv/core.stamp $@
 
 install: .venv/dev.stamp
@@ -45,6 +47,10 @@ chromium:
 
 test: .venv/dev.stamp
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
+
+# on a new machine, before the tests: each process of the tests would compile for itself what all of them call
+compiled: .venv/dev.stamp
+	set -e; work=$$(mktemp -d); here=$$PWD; cd $$work; $$here/$(BIN)/robotdiffuse demo >/dev/null; rm -r $$work
 
 test-all: .venv/dev.stamp chromium
 	$(BIN)/python -m pytest -n 2 --dist worksteal
