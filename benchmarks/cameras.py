@@ -49,8 +49,7 @@ from scipy.spatial.transform import Rotation
 
 from common import FIRST, TIME_LIMIT, header, parse, print_table, progress, use_processor_time
 from robotdiffuse.core.output_files import JsonLines
-from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Values
+from robotdiffuse.core.types import PlanResult, Values
 from robotdiffuse.evaluation.statistics import compare, wilson_interval
 from robotdiffuse.learning.completion import (
     CameraPlaces,

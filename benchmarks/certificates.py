@@ -30,13 +30,11 @@ from common import dense, header, parse, parts_of, print_table, progress
 from robotdiffuse.certificates.search import certify
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path as JointPath
-from robotdiffuse.core.types import Status
+from robotdiffuse.core.types import PlanResult, Status
 from robotdiffuse.problems.files import problem_record
-from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.problems.held_out import held_out_problem
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.validation.report import Report
 from robotdiffuse.validation.validator import VerifySettings, verify, verify_trajectory
 

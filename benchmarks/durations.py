@@ -32,8 +32,7 @@ from common import (
     use_processor_time,
 )
 from robotdiffuse.core.output_files import write_atomically
-from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import LENGTH, TIME, Trajectory
+from robotdiffuse.core.types import LENGTH, TIME, PlanResult, Trajectory
 from robotdiffuse.evaluation.problem_sets import gather_cases
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.planner import Planner

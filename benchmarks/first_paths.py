@@ -25,8 +25,7 @@ from robotdiffuse.planning.search.rrt import AnytimeSearch, SearchSettings, usua
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.problems.files import load_problems
-from robotdiffuse.problems.goals import JointGoal
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 
 FAMILIES = ("rop", "rop_dense", "shelf", "crate", "table", "clutter", "kitchen", "cabinet")

@@ -32,14 +32,17 @@ from robotdiffuse.baselines.controls import ControlSettings
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core import tables
 from robotdiffuse.core.tables import Cell, Column, Table, show
-from robotdiffuse.evaluation.methods import (
+from robotdiffuse.evaluation.runs import (
     NETWORK_ALONE,
+    Clock,
     Draw,
+    Record,
+    Run,
     from_control,
     from_network,
+    run_all,
     sampled,
 )
-from robotdiffuse.evaluation.runs import Clock, Record, Run, run_all
 from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
 from robotdiffuse.learning.motion_model import MAX_CLEARANCE, ClearanceFn, MotionModel
 from robotdiffuse.planning.diffusion import Diffusion

@@ -33,8 +33,16 @@ from common import (
 )
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.tables import Figure
-from robotdiffuse.evaluation.methods import fields_of, from_network, validated
-from robotdiffuse.evaluation.runs import Fields, Method, Record, Run, run_all
+from robotdiffuse.evaluation.runs import (
+    Fields,
+    Method,
+    Record,
+    Run,
+    fields_of,
+    from_network,
+    run_all,
+    validated,
+)
 from robotdiffuse.planning.diffusion import Diffusion, DiffusionSettings
 from robotdiffuse.planning.search.rrt import AORRTC
 from robotdiffuse.problems.families import FAMILIES

@@ -38,9 +38,8 @@ from common import (
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.types import LENGTH
 from robotdiffuse.core.types import Path as JointPath
-from robotdiffuse.evaluation.methods import planned
 from robotdiffuse.evaluation.problem_sets import gather_cases
-from robotdiffuse.evaluation.runs import Clock, Record, run_all
+from robotdiffuse.evaluation.runs import Clock, Record, planned, run_all
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.families import FAMILIES, load_family

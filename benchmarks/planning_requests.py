@@ -52,15 +52,13 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
-from robotdiffuse.core.types import Trajectory
+from robotdiffuse.core.types import PlanResult, Trajectory
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.files import load_motion_bench_maker
-from robotdiffuse.problems.goals import Goal, JointGoal, PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.held_out import SEED, held_out_problem
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import Goal, JointGoal, PoseGoal, PosesGoal, Problem, poses_of
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.simulation.world import World
 from robotdiffuse.validation.tolerances import goal_error

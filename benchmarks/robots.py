@@ -22,8 +22,8 @@ import numpy as np
 from common import FIRST, dense, header, parse, print_table, progress, use_processor_time
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import rotation_angle, transform
+from robotdiffuse.core.types import PlanResult
 from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.problems.problem import Problem

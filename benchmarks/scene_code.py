@@ -38,10 +38,9 @@ from torch import Tensor, nn
 from common import FIRST, header, parse, parts_of, print_table, progress, use_processor_time
 from robotdiffuse.baselines.controls import smooth_noise
 from robotdiffuse.core.output_files import JsonLines, write_atomically
-from robotdiffuse.datasets.rows import read_rows
-from robotdiffuse.datasets.shards import SPLITS, read_shard, shard_indices
-from robotdiffuse.evaluation.methods import validated
+from robotdiffuse.datasets.shards import SPLITS, read_rows, read_shard, shard_indices
 from robotdiffuse.evaluation.problem_sets import case_file, validator
+from robotdiffuse.evaluation.runs import validated
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
 from robotdiffuse.generation.factory import GenerationSettings, generate

@@ -12,7 +12,7 @@ from helpers.trainings import trained
 from robotdiffuse import Box, JointGoal, Problem, Scene, verify
 from robotdiffuse.baselines.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.datasets.rows import resample
+from robotdiffuse.datasets.shards import resample
 from robotdiffuse.learning.checkpoint import save_network
 from robotdiffuse.learning.mpnet import MPNetNetwork, MPNetSettings, sorted_along_curve
 from robotdiffuse.learning.training.batches import TrajectoryData

@@ -10,7 +10,7 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.commands import python
 from helpers.refusals import refuses
-from robotdiffuse.core.bounds import rigid_transform
+from robotdiffuse.core.errors import rigid_transform
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.scenes.shapes import Shape
 

@@ -12,7 +12,7 @@ from numpy import ndarray
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.commands import python
-from robotdiffuse.core.bounds import Value, read_only
+from robotdiffuse.core.types import Value, read_only
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.problems.constraints import FrameConstraint
 from robotdiffuse.robots.bodies import AttachedBody, ConvexMesh, Surface

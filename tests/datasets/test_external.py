@@ -13,8 +13,7 @@ from helpers.refusals import refuses
 from helpers.stores import line, random_arrays, record, write_motions, write_store
 from robotdiffuse.datasets import external as robot_npz
 from robotdiffuse.datasets.external import export_npz, import_npz
-from robotdiffuse.datasets.rows import problem_of
-from robotdiffuse.datasets.shards import SPLITS, check_shard, read_manifest, read_shard, write_shard
+from robotdiffuse.datasets.shards import SPLITS, check_shard, problem_of, read_manifest, read_shard, write_shard
 from robotdiffuse.scenes.scene_arrays import SPHERE
 
 

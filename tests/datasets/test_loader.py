@@ -16,8 +16,17 @@ from helpers.refusals import refuses
 from helpers.stores import manifest_of, random_arrays, write_store
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.datasets.loader import RopBatch, RopDataset
-from robotdiffuse.datasets.rows import resample, turned, turns_about_vertical
-from robotdiffuse.datasets.shards import SPLITS, read_shard, shard_path, split_of, write_manifest, write_shard
+from robotdiffuse.datasets.shards import (
+    SPLITS,
+    read_shard,
+    resample,
+    shard_path,
+    split_of,
+    turned,
+    turns_about_vertical,
+    write_manifest,
+    write_shard,
+)
 from robotdiffuse.problems.families.rop import ROP_DENSE
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 

@@ -12,8 +12,7 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.refusals import refuses
 from helpers.stores import line, random_motions, record, write_motions
-from robotdiffuse.datasets.rows import motion_of, problem_of
-from robotdiffuse.datasets.shards import pick_rows, read_shard, shard_path, write_shard
+from robotdiffuse.datasets.shards import motion_of, pick_rows, problem_of, read_shard, shard_path, write_shard
 from robotdiffuse.evaluation import data_report
 from robotdiffuse.evaluation.checks import check_data
 from robotdiffuse.evaluation.report import histograms

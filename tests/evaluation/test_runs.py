@@ -10,8 +10,7 @@ import pytest
 import robotdiffuse as rd
 from helpers.panda import GOAL, PANDA, START
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.evaluation.methods import planned, restarted, sampled
-from robotdiffuse.evaluation.runs import Fields, Record, Run, run_all
+from robotdiffuse.evaluation.runs import Fields, Record, Run, planned, restarted, run_all, sampled
 from robotdiffuse.planning.search.rrt import RRTConnect
 from robotdiffuse.problems.held_out import Case
 

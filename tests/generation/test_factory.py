@@ -26,8 +26,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import OutputError
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.transforms import rotation_from_quaternion
-from robotdiffuse.datasets.rows import path_of, problem_of
-from robotdiffuse.datasets.shards import check_shard, read_manifest, read_shard
+from robotdiffuse.datasets.shards import check_shard, path_of, problem_of, read_manifest, read_shard
 from robotdiffuse.generation import GenerationSettings, factory, generate
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
 from robotdiffuse.generation.factory import PROBLEMS_PER_SHARD, draw, make_shard, solve

@@ -28,7 +28,7 @@ import yaml
 
 from helpers.quick_preparation import QUICK, coarse_grids
 from robotdiffuse.cli import build_parser, main
-from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import PlanResult
 from robotdiffuse.problems.files import load_problem
 from robotdiffuse.robots.fitting.preparation import add_robot
 

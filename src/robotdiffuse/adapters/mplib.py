@@ -19,14 +19,13 @@ from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from robotdiffuse.core.bounds import numbers, positive, rigid_transform
-from robotdiffuse.core.errors import InputError, check_list, shown
+from robotdiffuse.core.errors import InputError, check_list, numbers, positive, rigid_transform, shown
 from robotdiffuse.core.input_files import read_bytes
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import inverse, pose, transform
+from robotdiffuse.core.types import PlanResult
 from robotdiffuse.planning.workspace import Workspace
 from robotdiffuse.problems.compiled_constraints import rotation_vector
-from robotdiffuse.problems.goals import JointGoal
+from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.bodies import RigidShape
 from robotdiffuse.robots.fitting.preparation import add_robot

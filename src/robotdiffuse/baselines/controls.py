@@ -14,11 +14,9 @@ from numpy import ndarray
 from robotdiffuse.baselines.straight_line import shortest_accepted, straight_lines
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, OneOf, Settings
-from robotdiffuse.core.types import Configuration, Configurations
-from robotdiffuse.datasets.rows import read_rows
-from robotdiffuse.datasets.shards import SPLITS, read_manifest
+from robotdiffuse.core.types import Configuration, Configurations, PlanResult
+from robotdiffuse.datasets.shards import SPLITS, read_manifest, read_rows
 from robotdiffuse.learning.guidance import CollisionGuidance, Trajectories
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import nearest_goals

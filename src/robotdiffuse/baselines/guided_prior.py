@@ -85,9 +85,8 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.deadline import OutOfTimeError, check_time, deadline
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Filled, Natural, NotNegative, Positive, Settings, Share
-from robotdiffuse.core.types import Configurations
+from robotdiffuse.core.types import Configurations, PlanResult
 from robotdiffuse.learning.diffusion import NoiseLevels, NoiseSchedule, reverse_process
 from robotdiffuse.learning.guidance import Trajectories
 from robotdiffuse.learning.motion_model import MotionModel

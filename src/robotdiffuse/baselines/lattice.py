@@ -31,9 +31,8 @@ from robotdiffuse.collision.kernels.motions import make_scratch, motion_free
 from robotdiffuse.collision.motions import FINEST_RESOLUTION
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import allocation_free, kernel
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Positive
-from robotdiffuse.core.types import Configuration, Configurations, Status
+from robotdiffuse.core.types import Configuration, Configurations, PlanResult, Status
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import CheckedSettings, Planner, ever_finer
 from robotdiffuse.planning.start_goal import StartGoal, padded_space

@@ -23,9 +23,8 @@ import numpy as np
 
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, NotNegative, Positive
-from robotdiffuse.core.types import Configuration, Configurations
+from robotdiffuse.core.types import Configuration, Configurations, PlanResult
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, scene_clouds
 from robotdiffuse.planning.start_goal import StartGoal

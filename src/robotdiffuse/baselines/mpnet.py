@@ -30,9 +30,8 @@ from numpy import ndarray
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import finer_resolution
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, NotNegative, Positive
-from robotdiffuse.core.types import Configurations
+from robotdiffuse.core.types import Configurations, PlanResult
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import Attempt, LearnedPlanner, LearnedSettings, ranked, scene_clouds
 from robotdiffuse.planning.search import rrt_kernel

@@ -30,9 +30,8 @@ import numpy as np
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import finer_resolution
 from robotdiffuse.core.errors import InputError, needs
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Positive
-from robotdiffuse.core.types import Configuration, Configurations, Path
+from robotdiffuse.core.types import Configuration, Configurations, Path, PlanResult
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import CheckedSettings, Planner, ever_finer
 from robotdiffuse.planning.start_goal import StartGoal

@@ -7,9 +7,8 @@ from typing import Annotated
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import OneOf, Settings
-from robotdiffuse.core.types import Configurations, Path
+from robotdiffuse.core.types import Configurations, Path, PlanResult
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.start_goal import StartGoal

@@ -13,8 +13,7 @@ from numpy import ndarray
 from robotdiffuse.certificates.bounds import Claim, Plane, Stretches
 from robotdiffuse.certificates.checker import Findings, check
 from robotdiffuse.certificates.proof import DECIMALS, MotionProof, StretchProof, Tolerances, joined
-from robotdiffuse.core.bounds import MAX_RATE, numbers, one_line, within
-from robotdiffuse.core.errors import InputError, reading, shown
+from robotdiffuse.core.errors import MAX_RATE, InputError, numbers, one_line, reading, shown, within
 from robotdiffuse.core.input_files import known_ending, read_json
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.settings import Number, converted

@@ -49,8 +49,7 @@ from robotdiffuse.core.types import (
     Vector,
 )
 from robotdiffuse.problems.constraints import AxisCone, CartesianLine, Constraint, OnPlane, PositionBox
-from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal, poses_of
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import AnyGoal, Goal, JointGoal, PosesGoal, Problem, poses_of
 from robotdiffuse.robots.bodies import Inertia
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import Robot

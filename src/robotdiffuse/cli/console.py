@@ -13,7 +13,7 @@ from robotdiffuse.core.tables import Table, show
 
 if TYPE_CHECKING:
     from robotdiffuse.certificates.certificate import Certificate
-    from robotdiffuse.core.results import PlanResult
+    from robotdiffuse.core.types import PlanResult
     from robotdiffuse.problems.problem import Problem
     from robotdiffuse.validation.report import Report
 

@@ -12,8 +12,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import check_output
 from robotdiffuse.core.tables import show
 from robotdiffuse.datasets.external import export_npz, import_npz
-from robotdiffuse.datasets.rows import motion_of, scenes_of
-from robotdiffuse.datasets.shards import random_rows, read_manifest
+from robotdiffuse.datasets.shards import motion_of, random_rows, read_manifest, scenes_of
 from robotdiffuse.evaluation.checks import check_data
 from robotdiffuse.evaluation.data_report import tables, write_page
 from robotdiffuse.generation import GenerationSettings, generate

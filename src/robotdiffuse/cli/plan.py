@@ -10,8 +10,8 @@ from robotdiffuse.cli.console import Spinner, print_next_view, print_result
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.interrupts import exit_on_interrupt
 from robotdiffuse.core.output_files import check_output
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
+from robotdiffuse.core.types import PlanResult
 from robotdiffuse.interop import WRITERS, check_export, write_motion
 from robotdiffuse.planning import CLEARANCE, DEFAULT_PLANNER, PLANNERS, load_planner, planner_settings
 from robotdiffuse.planning.context import PlanRequest, requested_clearance

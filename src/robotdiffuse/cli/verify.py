@@ -7,9 +7,8 @@ from robotdiffuse.cli.arguments import Namespace
 from robotdiffuse.cli.console import clearances
 from robotdiffuse.core.errors import InputError, joined, located
 from robotdiffuse.core.output_files import check_output
-from robotdiffuse.core.results import NO_PROBLEM, PlanResult, load_result
+from robotdiffuse.core.types import NO_PROBLEM, PlanResult, Trajectory, load_result
 from robotdiffuse.core.types import Path as Waypoints
-from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop import read_motion
 from robotdiffuse.interop.recorded_motion import motion_of_robot, problem_of_motion
 from robotdiffuse.problems.files import load_problem, problem_from_record

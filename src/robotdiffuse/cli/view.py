@@ -15,9 +15,8 @@ from robotdiffuse.cli.verify import read_result, read_solved
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.input_files import read_json
 from robotdiffuse.core.output_files import check_output
-from robotdiffuse.core.results import PROBLEM_ENDINGS, PlanResult
 from robotdiffuse.core.tables import Column, Table, show
-from robotdiffuse.core.types import Trajectory
+from robotdiffuse.core.types import PROBLEM_ENDINGS, PlanResult, Trajectory
 from robotdiffuse.planning.pipeline.unknown_space import policy_for, predicted_obstacles
 from robotdiffuse.problems.files import load_problem, problem_record
 from robotdiffuse.problems.problem import PREDICTED, Problem

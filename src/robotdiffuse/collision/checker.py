@@ -8,8 +8,8 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_robot, compile_scene_for, robot_groups
 from robotdiffuse.collision.kernels import collision_cost, lane_clearance, lane_collision
-from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import for_kernels
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 

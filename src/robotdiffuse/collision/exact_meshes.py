@@ -33,9 +33,9 @@ from robotdiffuse.collision.convex_geometry import (
 )
 from robotdiffuse.collision.kernels import mesh_bounds as kernel
 from robotdiffuse.collision.surface_pairs import MAX_OVERLAP, SurfacePair, surface_pairs
-from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.deadline import check_time
 from robotdiffuse.core.transforms import transform
+from robotdiffuse.core.types import for_kernels
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose, coal_rounded, coal_surface
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot

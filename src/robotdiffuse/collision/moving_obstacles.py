@@ -24,10 +24,9 @@ from robotdiffuse.collision.kernel_arrays import bounding_spheres, robot_groups
 from robotdiffuse.collision.kernels import moving_obstacles as kernel
 from robotdiffuse.collision.kernels.moving_obstacles import CLEARANCE_CAP, Links, Tasks, Tracks
 from robotdiffuse.collision.motions import with_covering_spheres
-from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.loading import loading
 from robotdiffuse.core.transforms import inverse, moved_spheres, quaternion_from_rotation
-from robotdiffuse.core.types import Values, interpolated
+from robotdiffuse.core.types import Values, for_kernels, interpolated
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.motion_bounds import radii_of
 from robotdiffuse.robots.robot import Robot

@@ -8,8 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import MAX_RPY, unit_quaternion, vector
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import MAX_RPY, InputError, unit_quaternion, vector
 from robotdiffuse.core.types import Points, Pose, Rotation, Spheres, Vector
 
 IDENTITY = np.eye(4)

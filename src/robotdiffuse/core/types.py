@@ -1,23 +1,38 @@
-"""Path, Trajectory, search Tree, and the Status of a planning call."""
+"""Path, Trajectory, search Tree, the Status of a planning call, PlanResult, and the result file format."""
 
 import csv
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from types import NoneType
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_DURATION, MAX_RATE, Value, numbers, one_line, rows
-from robotdiffuse.core.errors import InputError, distinct, joined, repeated, shown
+from robotdiffuse.core.errors import (
+    MAX_COORDINATE,
+    MAX_DURATION,
+    MAX_RATE,
+    InputError,
+    check_type,
+    distinct,
+    joined,
+    located,
+    numbers,
+    one_line,
+    repeated,
+    rows,
+    shown,
+)
+from robotdiffuse.core.input_files import known_ending, read_json
 from robotdiffuse.core.output_files import check_output, write_atomically
-from robotdiffuse.core.settings import Bound, converted
+from robotdiffuse.core.settings import Bound, Natural, Number, converted
 
 Configuration = Float[ndarray, "dof"]
 """Joint positions [rad], [m] for prismatic joints."""
@@ -114,6 +129,79 @@ UNTIL = (FIRST, CONVERGED, TIME_LIMIT)
 LENGTH = "length"
 TIME = "time"
 OBJECTIVES = (LENGTH, TIME)
+
+
+T = TypeVar("T")
+
+
+class Value:
+    """Base of the dataclasses that are values: the arrays in their fields are read-only.
+
+    Caches use the object's identity as the key, so its arrays must not change. A writable array is copied, so
+    that the caller's array stays writable. A subclass that defines `__post_init__` calls this class's
+    `__post_init__` at its end.
+    """
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "__repr__" not in cls.__dict__:  # else @dataclass adds a __repr__ that prints whole arrays
+            cls.__repr__ = Value.__repr__
+
+    def __repr__(self) -> str:
+        return one_line(self)
+
+    def __dir__(self) -> list[str]:
+        """The attributes, without the caches that modules keep in `__dict__` under their dotted names."""
+        return [name for name in super().__dir__() if "." not in name]
+
+    def __post_init__(self) -> None:
+        for name in (entry.name for entry in fields(self)):  # type: ignore[arg-type]
+            value = getattr(self, name)
+            frozen = read_only(value)
+            if frozen is not value:
+                object.__setattr__(self, name, frozen)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # arrays from a pickle or a deep copy are writable
+        self.__dict__.update({name: read_only(value) for name, value in state.items()})
+
+
+def read_only(value: T) -> T:
+    """Returns the value unchanged if all its arrays are read-only, else a copy with read-only arrays. Arrays
+    in tuples and dictionaries count too."""
+    if isinstance(value, ndarray):
+        if not _writable(value):
+            return value
+        frozen = np.array(value)
+        frozen.setflags(write=False)
+        return frozen  # type: ignore[return-value]
+    if isinstance(value, tuple):
+        frozen = [read_only(entry) for entry in value]
+        if all(a is b for a, b in zip(frozen, value, strict=True)):
+            return value
+        return value._make(frozen) if hasattr(value, "_make") else tuple(frozen)  # type: ignore
+    if isinstance(value, dict):
+        frozen = {key: read_only(entry) for key, entry in value.items()}
+        return value if all(frozen[key] is value[key] for key in value) else frozen  # type: ignore[return-value]
+    return value
+
+
+def for_kernels(array: ndarray, dtype: type = np.float64) -> ndarray:
+    """The array as compiled code takes it: contiguous and writable. Numba gives read-only arrays another
+    type, so it would compile all functions again for them."""
+    array = np.ascontiguousarray(array, dtype)
+    return array if array.flags.writeable else array.copy()
+
+
+def _writable(array: ndarray) -> bool:
+    """Whether the array's memory may be written to, through this array or an array that it is a view of.
+    Memory of an owner outside NumPy counts as writable unless the owner is `bytes`."""
+    owner: Any = array
+    while isinstance(owner, ndarray):
+        if owner.flags.writeable:
+            return True
+        owner = owner.base
+    return owner is not None and not isinstance(owner, bytes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -440,3 +528,259 @@ def _times(name: str, value: object, count: int | None) -> ndarray:
         duration, limit = distinct(span, MAX_DURATION)
         raise InputError(f"{name} span {duration} s; a motion must not last longer than {limit} s")
     return times
+
+
+PROBLEM_ENDINGS = (".yaml", ".yml", ".jsonl")
+"""Endings that problem files may have and result files never have."""
+NO_PROBLEM = "without its problem"
+"""Beginning of the note with the reason why a result was saved without its problem."""
+REQUIRED = ("status", "reason", "planner", "robot", "joint_names", "planning_time", "verified", "seed")
+
+
+@dataclass(frozen=True, eq=False)
+class PlanResult:
+    """The answer of a planner. `path` is set if and only if `status` is SOLVED; every such path has passed
+    `verify`.
+
+    Fields that describe a motion are None if there is none. They are annotated with Any, so that type
+    checkers ask for no assertions in code for solved results.
+    """
+
+    status: Status
+    """How the call ended."""
+    reason: str
+    """A sentence: if SOLVED, which part of the planner found the path; otherwise why there is no motion, and
+    what to do."""
+    planner: str
+    """Name of the planner."""
+    robot: str
+    """Name of the robot."""
+    planning_time: float
+    """Wall time of plan() until the returned path is validated [s], without loading time. The path's final
+    time parameterization follows and does not count, except with waypoints, camera views or moving
+    obstacles."""
+    seed: int
+    """Seed of the random numbers."""
+    stage: str = ""
+    """The part of the planner that produced the path, e.g. 'aorrtc', 'straight_line', 'network'."""
+    path: Path | Any = None
+    """Waypoints from the start to a goal."""
+    trajectory: Trajectory | Any = None
+    """The timed motion along the path."""
+    min_clearance: float | Any = None
+    """Lower bound on all distances along the motion [m]: the smaller of `scene_clearance` and
+    `self_clearance`."""
+    scene_clearance: float | Any = None
+    """Lower bound on the distance to obstacles [m]."""
+    self_clearance: float | Any = None
+    """Lower bound on the distance between links [m]."""
+    notes: tuple[str, ...] = field(default=())
+    """Input that was changed or ignored, e.g. a start clamped to a limit."""
+    goal_index: int | None = None
+    """Index from 0 of the goal where the motion ends, among the goals of an `AnyGoal` or the rows of several
+    goal configurations; 0 for a single goal, None without a motion."""
+    progress: tuple[tuple[float, float], ...] = ()
+    """Time [s since the call] and joint-space length [rad] of each path that was shorter than all before; the
+    last pair is the returned path."""
+    refused: str = ""
+    """`Violation.kind` of the last path that the validator rejected; "" if it rejected none."""
+    assumption: str = ""
+    """Problems with camera views: the assumption about unknown space under which the motion was planned, e.g.
+    "points padded by 9 cm". "as seen" assumes that unknown space has no obstacles. "" without views."""
+    confidence: float | None = None
+    """Problems with camera views: probability that the motion hits no obstacle in unknown space. `verify`
+    checks observed obstacles only."""
+    swept_probability: float | None = None
+    """Sum of the predicted occupancy probabilities of all unknown voxels that the motion sweeps; None without
+    the predicted policy for unknown space."""
+    unknown_region: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    """Lower and upper corner, in the base frame [m], of a box around the part of the unknown space
+    that the motion crosses with the largest summed probability to be occupied; None if it crosses none."""
+    fraction: float | None = None
+    """Problems with a Cartesian line: the fraction of the line that the arm can follow from the start, 1 if
+    there is a motion. If it is below 1, `reason` says what stops the arm."""
+    corner_deviations: tuple[float, ...] = field(default=(), repr=False)
+    """For each waypoint of the path, the largest distance at which the motion may pass it, rounding the
+    corner [rad, joint-space L2]. Empty without a path, and in results that were read from a file."""
+    trees: tuple[Tree, ...] = field(default=(), repr=False)
+    """Search trees from the start and from the goals, when the shortest path was found or time ran out. Empty
+    unless the planner's setting `keep_trees` is true; result files omit them."""
+    problem: Any = field(default=None, repr=False)
+    """The `Problem`, which `save` and `rd.show` use; None in results read from files."""
+
+    def __repr__(self) -> str:
+        planned = f"{self.planner} in {1e3 * self.planning_time:.3g} ms"
+        if self.path is None:
+            return f"PlanResult({self.status.value}, {planned}: {self.reason})"
+        notes = f", {len(self.notes)} notes" if self.notes else ""
+        return f"PlanResult({self.status.value}, {planned}: {self.path!r}, {self.trajectory!r}{notes})"
+
+    @property
+    def solved(self) -> bool:
+        return self.status is Status.SOLVED
+
+    @property
+    def path_length(self) -> float | Any:
+        return None if self.path is None else self.path.length
+
+    @property
+    def duration(self) -> float | Any:
+        """Duration of the motion [s]; None without a trajectory."""
+        return None if self.trajectory is None else self.trajectory.duration
+
+    @property
+    def stops(self) -> int | Any:
+        """Number of times that the arm rests between start and goal; None without a trajectory."""
+        return None if self.trajectory is None else len(self.trajectory.stops)
+
+    def save(self, file: str | FilePath, problem: dict[str, Any] | None = None) -> None:
+        """Write the result.
+
+        Args:
+            file: A .json file for the result and its problem, or a .csv file for the trajectory alone.
+            problem: The content of a problem file; None: the result's own problem. If its robot is neither
+                bundled nor read from a file, the file holds no problem, and a note says so.
+
+        Raises:
+            InputError: For another ending, a file that cannot be written, or .csv without a trajectory.
+        """
+        path = check_output(file, (".json", ".csv"))
+        if path.suffix.lower() == ".json":
+            notes = self.notes
+            if problem is None and self.problem is not None:
+                try:
+                    problem = self.problem.record()
+                except InputError as error:
+                    notes = (*notes, f"{NO_PROBLEM}: {error}")
+            record = replace(self, notes=notes).record(problem)
+            write_atomically(path, json.dumps(record, allow_nan=False) + "\n")
+        elif self.trajectory is None:
+            raise InputError(f"{path}: there is no trajectory to write ({self.status.value}); use .json")
+        else:
+            self.trajectory.save(path)
+
+    def record(self, problem: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Convert the result to JSON values.
+
+        Args:
+            problem: The content of a problem file, to include.
+
+        Returns:
+            The content of a result file.
+        """
+        path = self.path
+        record: dict[str, Any] = {"status": self.status.value}
+        record |= {name: getattr(self, name) for name in RECORDED}
+        record |= {
+            "verified": self.solved,
+            "path_length": self.path_length,
+            "duration": self.duration,
+            "stops": self.stops,
+            "joint_names": [] if path is None else list(path.joint_names),
+            "waypoints": None if path is None else path.positions.tolist(),
+            "times": [],
+            **{name: [] for name in ROWS},
+        }
+        if self.trajectory is not None:
+            record |= self.trajectory.record()
+        return record if problem is None else record | {"problem": problem}
+
+
+@dataclass(frozen=True, eq=False)
+class ResultFile:
+    """Content of a result file."""
+
+    result: PlanResult
+    problem: dict[str, Any] | None
+    """The problem as in a problem file, if it was saved too."""
+
+
+def load_result(file: str | FilePath) -> ResultFile:
+    """Read and check a result file.
+
+    Args:
+        file: A .json file that `PlanResult.save` or `robotdiffuse plan --out` wrote.
+
+    Returns:
+        The result, and the content of its problem file if that was saved too.
+
+    Raises:
+        InputError: For a file that cannot be read, and for fields that are missing, of the wrong shape or not
+            finite.
+
+    Examples:
+        >>> problem = rd.Problem(rd.load_robot("panda"), rd.Scene(), "ready", "extended")
+        >>> rd.plan(problem, until="first").save("result.json")
+        >>> rd.load_result("result.json").result.status.value
+        'solved'
+    """
+    planned = f"it is a problem; `robotdiffuse plan {file} --out result.json` makes a result of it"
+    if FilePath(str(file)).suffix.lower() in PROBLEM_ENDINGS:
+        raise InputError(f"{file} is not a result file: {planned}")
+    known_ending(file, "result file", (".json",))
+    record = read_json(file)
+    if not isinstance(record, dict):
+        raise InputError(f"{file} is not a result file: it must hold one JSON object")
+    if "scene" in record and "status" not in record:
+        raise InputError(f"{file} is not a result file: {planned}")
+    missing = [name for name in REQUIRED if record.get(name) is None]
+    if missing:
+        raise InputError(f"{file} is not a result file: {', '.join(missing)} missing")
+    with located(file):
+        problem = record.get("problem")
+        check_type("problem", problem, (dict, NoneType), "an object")
+        return ResultFile(_result(record), problem)
+
+
+Corner = tuple[Number, Number, Number]
+RECORDED: dict[str, Any] = {
+    "reason": str,
+    "planner": str,
+    "stage": str,
+    "robot": str,
+    "planning_time": Number,
+    "seed": int,
+    "min_clearance": Number,
+    "scene_clearance": Number,
+    "self_clearance": Number,
+    "notes": tuple[str, ...],
+    "goal_index": Natural,
+    "progress": tuple[tuple[Number, Number], ...],
+    "refused": str,
+    "assumption": str,
+    "confidence": Number,
+    "swept_probability": Number,
+    "unknown_region": tuple[Corner, Corner],
+    "fraction": Number,
+}
+"""Fields that result files hold under the same name, in this order, with their types. A field that the result
+lacks is null."""
+
+
+def _result(record: dict[str, Any]) -> PlanResult:
+    statuses = {status.value: status for status in Status}
+    if not isinstance(record["status"], str) or record["status"] not in statuses:
+        raise InputError(f"status is {shown(record['status'])}; known: {', '.join(statuses)}")
+    status = statuses[record["status"]]
+    solved = status is Status.SOLVED
+    if record["verified"] is not solved:
+        raise InputError(f"verified is {shown(record['verified'])}, but status is {shown(status.value)}")
+    values = {
+        name: converted(name, kind, record[name])
+        for name, kind in RECORDED.items()
+        if record.get(name) is not None
+    }
+    if solved:
+        names, arrays = check_motion_arrays(record["joint_names"], {"waypoints": record.get("waypoints")})
+        values["path"] = Path(names, arrays["waypoints"])
+        values["trajectory"] = _trajectory(record) if record.get("times") else None
+    return PlanResult(status=status, **values)
+
+
+def _trajectory(record: dict[str, Any]) -> Trajectory:
+    rows_of = {name: record.get(name) for name in ("positions", "times", *RATES)}
+    names, arrays = check_motion_arrays(record["joint_names"], rows_of)
+    if arrays["times"][0] != 0:
+        raise InputError(f"times begin at {arrays['times'][0]:g} s; they must begin at 0")
+    check_increasing(arrays["times"])
+    return Trajectory(names, **arrays)

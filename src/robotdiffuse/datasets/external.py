@@ -20,19 +20,20 @@ from robotdiffuse import __version__
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.core.bounds import numbers
-from robotdiffuse.core.errors import InputError, reading, shown
+from robotdiffuse.core.errors import InputError, numbers, reading, shown
 from robotdiffuse.core.input_files import input_file
 from robotdiffuse.core.output_files import check_output, lock_folder, write_atomically
 from robotdiffuse.core.types import Path, Trajectory
-from robotdiffuse.datasets.rows import Row, resample, row_of
 from robotdiffuse.datasets.shards import (
     MANIFEST,
     SPLITS,
     Manifest,
+    Row,
     check_shapes,
     read_manifest,
     read_shard,
+    resample,
+    row_of,
     shard_indices,
     split_of,
     write_manifest,

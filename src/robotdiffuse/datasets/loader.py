@@ -19,8 +19,7 @@ except ImportError:
     raise ImportError('RopDataset needs torch, not installed: pip install "robotdiffuse[train]"') from None
 
 from robotdiffuse.core.errors import InputError, check_name
-from robotdiffuse.datasets.rows import read_rows
-from robotdiffuse.datasets.shards import SPLITS, read_manifest
+from robotdiffuse.datasets.shards import SPLITS, read_manifest, read_rows
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.robots.kinematic_tree import JointNormalizer
 from robotdiffuse.robots.robot import Robot

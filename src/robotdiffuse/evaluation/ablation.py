@@ -28,18 +28,19 @@ from robotdiffuse.core.tables import Column, Figure, Table
 from robotdiffuse.core.types import Values
 from robotdiffuse.datasets.shards import read_manifest
 from robotdiffuse.evaluation.bench_comparisons import Mean
-from robotdiffuse.evaluation.methods import (
-    NETWORK_ALONE,
-    from_control,
-    from_network,
-    sampled,
-    sampling_digest,
-)
 from robotdiffuse.evaluation.metrics import link_length
 from robotdiffuse.evaluation.paper import paper_report, straight_line_counts
 from robotdiffuse.evaluation.problem_sets import hard_cases
 from robotdiffuse.evaluation.report import Report, share_cell
-from robotdiffuse.evaluation.runs import Record, run_all
+from robotdiffuse.evaluation.runs import (
+    NETWORK_ALONE,
+    Record,
+    from_control,
+    from_network,
+    run_all,
+    sampled,
+    sampling_digest,
+)
 from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
 from robotdiffuse.learning.checkpoint import load_network
 from robotdiffuse.learning.training.config import CONFIGS, EncoderTraining, planner_training

@@ -24,7 +24,6 @@ from robotdiffuse.core.errors import InputError, check_name
 from robotdiffuse.core.input_files import is_file
 from robotdiffuse.core.output_files import JsonLines, lock_folder
 from robotdiffuse.core.settings import Count, Filled, OneOf, Positive, Settings
-from robotdiffuse.evaluation.methods import planner_calls
 from robotdiffuse.evaluation.metrics import measured
 from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name
 from robotdiffuse.evaluation.report import processor, versions
@@ -39,6 +38,7 @@ from robotdiffuse.evaluation.runs import (
     Run,
     keep_records,
     load_average,
+    planner_calls,
     record_path,
     runs_of,
 )

@@ -22,15 +22,17 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.tables import Column, Table
 from robotdiffuse.core.types import Path
-from robotdiffuse.datasets.rows import path_of, problem_of, scenes_of
 from robotdiffuse.datasets.shards import (
     Manifest,
     Shard,
     check_shard,
     existing_shards,
+    path_of,
     pick_rows,
+    problem_of,
     read_manifest,
     read_shard,
+    scenes_of,
 )
 from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.runs import Record, read_records

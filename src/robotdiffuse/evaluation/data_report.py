@@ -12,13 +12,13 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.tables import NO_VALUE, Column, Table, plain
 from robotdiffuse.core.types import Mask
-from robotdiffuse.datasets.rows import scenes_of
 from robotdiffuse.datasets.shards import (
     SPLITS,
     Manifest,
     existing_shards,
     read_manifest,
     read_shard,
+    scenes_of,
     shard_path,
     split_of,
 )

@@ -24,11 +24,17 @@ from robotdiffuse.core.types import Configurations, Path
 from robotdiffuse.evaluation.bench import BenchSettings, Done, run_bench
 from robotdiffuse.evaluation.bench_comparisons import Bench, Mean, Section, read_bench, sections
 from robotdiffuse.evaluation.bench_report import about, crashes, success_over_time
-from robotdiffuse.evaluation.methods import NETWORK_ALONE, from_network, sampled, sampling_digest
 from robotdiffuse.evaluation.metrics import METRICS
 from robotdiffuse.evaluation.problem_sets import hard_cases, read_cases, validator
 from robotdiffuse.evaluation.report import Report, draw_plot, share_cell
-from robotdiffuse.evaluation.runs import Record, run_all
+from robotdiffuse.evaluation.runs import (
+    NETWORK_ALONE,
+    Record,
+    from_network,
+    run_all,
+    sampled,
+    sampling_digest,
+)
 from robotdiffuse.evaluation.statistics import Indicators, bootstrap_interval, comscores, wilson_interval
 from robotdiffuse.learning.diffusion import SAMPLERS
 from robotdiffuse.learning.motion_model import MotionModelSettings, link_clearances
@@ -37,9 +43,8 @@ from robotdiffuse.planning.diffusion import Diffusion, DiffusionSettings, encode
 from robotdiffuse.planning.pose_goals import GOAL_COUNT, pose_configurations
 from robotdiffuse.problems.families.family import POSITION
 from robotdiffuse.problems.families.rop import ROP, Rop
-from robotdiffuse.problems.goals import JointGoal, PoseGoal
 from robotdiffuse.problems.held_out import SEED, Case, CaseFile, Progress, goal_of
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
 
 if TYPE_CHECKING:

@@ -27,12 +27,14 @@ from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Settings, SettingsOf, Share
 from robotdiffuse.core.types import Configurations, Path, interpolated
-from robotdiffuse.datasets.rows import Row, resample, row_of
 from robotdiffuse.datasets.shards import (
     MANIFEST,
     Manifest,
+    Row,
     read_manifest,
     remove_leftovers,
+    resample,
+    row_of,
     shard_indices,
     write_manifest,
     write_shard,

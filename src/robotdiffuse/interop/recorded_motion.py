@@ -28,8 +28,7 @@ from robotdiffuse.core.types import (
     check_increasing,
     check_motion_arrays,
 )
-from robotdiffuse.problems.goals import JointGoal
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.scene import Scene
 

@@ -9,10 +9,9 @@ from jaxtyping import Bool, Float, Float32, Int32
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import for_kernels, form, numbers
-from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.errors import InputError, form, numbers, shown
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.types import Points, Values
+from robotdiffuse.core.types import Points, Values, for_kernels
 from robotdiffuse.perception.depth_view import FARTHEST, NEAREST, DepthNoise, DepthView
 
 MIN_RETURNS = 4

@@ -15,20 +15,21 @@ from numpy import ndarray
 from numpy.random import Generator
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import (
+from robotdiffuse.core.errors import (
     MAX_COORDINATE,
     MAX_RATE,
-    Value,
+    InputError,
+    check_type,
     numbers,
     positive,
     rigid_transform,
     rows,
+    shown,
     vector,
 )
-from robotdiffuse.core.errors import InputError, check_type, shown
 from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import placed
-from robotdiffuse.core.types import Configuration, Points, Pose
+from robotdiffuse.core.types import Configuration, Points, Pose, Value
 from robotdiffuse.scenes.shapes import PointCloud
 
 INTEGER_NO_RETURN = 65535

@@ -20,8 +20,17 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import numbers, positive, unit_quaternion, vector
-from robotdiffuse.core.errors import InputError, located, needs, reading, shown
+from robotdiffuse.core.errors import (
+    InputError,
+    located,
+    needs,
+    numbers,
+    positive,
+    reading,
+    shown,
+    unit_quaternion,
+    vector,
+)
 from robotdiffuse.core.input_files import (
     input_file,
     known_ending,

@@ -11,7 +11,7 @@ from jaxtyping import Int32, UInt8
 from numpy import ndarray
 from scipy.spatial import KDTree
 
-from robotdiffuse.core import bounds
+from robotdiffuse.core import errors
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.locked import locked
 from robotdiffuse.core.types import Configuration, Points, Values
@@ -106,7 +106,7 @@ class OccupancyMap:
     def add_points(self, points: Points, stamp: float = 0.0) -> None:
         """Take occupied points in the base frame into account [m], e.g. the points of an
         `rd.PointCloud.from_file`. They give no information about free space."""
-        at = MAP.indices(bounds.points("map", "points", points))
+        at = MAP.indices(errors.points("map", "points", points))
         at = at[MAP.contains(at)]
         counts = np.zeros(MAP.shape, np.int32)
         counts[tuple(at.T)] = 1
@@ -116,7 +116,7 @@ class OccupancyMap:
     def declare_free(self, zone: Corners) -> None:
         """Voxels inside a box, given by its low and high corner, count as free unless a view finds them
         occupied."""
-        low, high = bounds.rows("free_zone", zone, 2, 3)
+        low, high = errors.rows("free_zone", zone, 2, 3)
         if not (low < high).all():
             raise InputError(f"free_zone is {shown(zone)}; its low corner must be below its high corner")
         first = np.maximum(np.ceil((low - MAP.low) / MAP.edge - 1e-6), 0).astype(int)

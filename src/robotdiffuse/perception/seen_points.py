@@ -9,9 +9,8 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
 from robotdiffuse.collision.kernels.collision_cost import scene_distance
-from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.types import Configuration, Configurations, Points
+from robotdiffuse.core.types import Configuration, Configurations, Points, for_kernels
 from robotdiffuse.perception.depth_filter import PointErrors, filtered, grown_for_errors, point_errors
 from robotdiffuse.perception.depth_view import NEAREST, DepthView, SeenPoints
 from robotdiffuse.robots.frame_kernel import write

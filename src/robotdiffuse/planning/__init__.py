@@ -13,7 +13,7 @@ from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import CONVERGED, TIME
 
 if TYPE_CHECKING:
-    from robotdiffuse.core.results import PlanResult
+    from robotdiffuse.core.types import PlanResult
     from robotdiffuse.planning.planner import Planner
     from robotdiffuse.problems.problem import Problem
 

@@ -14,7 +14,6 @@ from numpy import ndarray
 
 from robotdiffuse.core.deadline import OutOfTimeError, check_cancelled, deadline
 from robotdiffuse.core.loading import loading_seconds
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Natural, OneOf, Settings
 from robotdiffuse.core.types import (
     CONVERGED,
@@ -23,6 +22,7 @@ from robotdiffuse.core.types import (
     UNTIL,
     Configurations,
     Path,
+    PlanResult,
     Status,
     Trajectory,
 )

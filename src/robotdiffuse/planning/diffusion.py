@@ -23,9 +23,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, NotNegative
-from robotdiffuse.core.types import Configuration, Configurations, Path
+from robotdiffuse.core.types import Configuration, Configurations, Path, PlanResult
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings, Trajectories
 from robotdiffuse.learning.motion_model import SamplingSettings
 from robotdiffuse.planning import PATH_CONSTRAINTS

@@ -13,14 +13,12 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.motions import path_length
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import rotation_about
-from robotdiffuse.core.types import Status
+from robotdiffuse.core.types import PlanResult, Status
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.problems.compiled_constraints import line_end, rotation_vector
 from robotdiffuse.problems.constraints import CartesianLine
-from robotdiffuse.problems.goals import JointGoal, PoseGoal
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots.ik_kernel import IKChain, IKParameters, follow, solve_seeds
 from robotdiffuse.robots.inverse_kinematics import (
     MAX_ITERATIONS,

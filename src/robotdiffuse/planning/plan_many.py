@@ -9,9 +9,8 @@ from numbers import Integral
 from typing import Any
 
 from robotdiffuse.core.errors import InputError, check_name, shown
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
-from robotdiffuse.core.types import Status
+from robotdiffuse.core.types import PlanResult, Status
 from robotdiffuse.planning import DEFAULT_PLANNER, load_planner
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.problems.problem import Problem, check_problem

@@ -9,9 +9,8 @@ from robotdiffuse.collision.motions import finer_resolution
 from robotdiffuse.core.deadline import OutOfTimeError
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.loading import compile_note, loading
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import NotNegative, Positive, Settings
-from robotdiffuse.core.types import CONVERGED
+from robotdiffuse.core.types import CONVERGED, PlanResult
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS, planners_that_support
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal

@@ -9,8 +9,7 @@ from numpy import ndarray
 from robotdiffuse.core.deadline import check_time
 from robotdiffuse.core.types import Configuration, Configurations
 from robotdiffuse.problems.compiled_constraints import POSE_TOLERANCE, PathConstraints
-from robotdiffuse.problems.goals import PoseGoal, PosesGoal, poses_of
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import PoseGoal, PosesGoal, Problem, poses_of
 from robotdiffuse.robots.inverse_kinematics import (
     InverseKinematicsSettings,
     each_pose,

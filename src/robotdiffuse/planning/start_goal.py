@@ -14,11 +14,10 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.loading import loading
-from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Configuration, Configurations, Status
+from robotdiffuse.core.types import Configuration, Configurations, PlanResult, Status
 from robotdiffuse.perception.depth_view import SeenPoints
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, OneGoal, PoseGoal, PosesGoal, poses_of
+from robotdiffuse.problems.problem import AnyGoal, Goal, JointGoal, OneGoal, PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.units import arm_in_cloud_note
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError, distinct
 from robotdiffuse.core.transforms import inverse, rotation_about, rotation_angle, rotation_z_to, transform
 from robotdiffuse.core.types import (
@@ -26,6 +25,7 @@ from robotdiffuse.core.types import (
     Rotation,
     Values,
     Vector,
+    for_kernels,
     interpolated,
 )
 from robotdiffuse.problems import constraint_kernel as kernel
@@ -37,8 +37,7 @@ from robotdiffuse.problems.constraints import (
     OnPlane,
     PositionBox,
 )
-from robotdiffuse.problems.goals import JointGoal, PoseGoal, poses_of
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem, poses_of
 from robotdiffuse.problems.projection_kernel import project_each
 from robotdiffuse.robots.inverse_kinematics import KINDS
 from robotdiffuse.robots.robot import Robot

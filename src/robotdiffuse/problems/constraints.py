@@ -11,9 +11,8 @@ from typing import Any, ClassVar, TypeVar, get_args, no_type_check
 
 import numpy as np
 
-from robotdiffuse.core.bounds import MAX_COORDINATE, Value, numbers, read_only, rigid_transform, vector
-from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.types import GivenVector, Pose, PoseOrNone
+from robotdiffuse.core.errors import MAX_COORDINATE, InputError, numbers, rigid_transform, shown, vector
+from robotdiffuse.core.types import GivenVector, Pose, PoseOrNone, Value, read_only
 
 # Smallest tolerances and angles that constraints may have [m], [rad].
 MIN_TOLERANCE = 1e-4

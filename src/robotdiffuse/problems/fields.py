@@ -33,15 +33,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robotdiffuse.core.bounds import numbers, unit_quaternion, vector
-from robotdiffuse.core.errors import InputError, check_name, located, shown
+from robotdiffuse.core.errors import InputError, check_name, located, numbers, shown, unit_quaternion, vector
 from robotdiffuse.core.settings import converted
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.core.types import Pose
 from robotdiffuse.perception.depth_view_files import read_views, view_entry
 from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint
-from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal
-from robotdiffuse.problems.problem import UNKNOWN_POLICIES, check_clearance
+from robotdiffuse.problems.problem import (
+    UNKNOWN_POLICIES,
+    AnyGoal,
+    Goal,
+    JointGoal,
+    PoseGoal,
+    PosesGoal,
+    check_clearance,
+)
 from robotdiffuse.robots import ROBOTS
 from robotdiffuse.robots.bodies import TOOL, Payload
 from robotdiffuse.robots.robot import Robot, named_pose

@@ -34,7 +34,6 @@ from robotdiffuse.problems.fields import (
     read_pose,
     rounded,
 )
-from robotdiffuse.problems.goals import Goal, JointGoal, PoseGoal
 from robotdiffuse.problems.moveit import (
     MoveItRequest,
     moveit_frames,
@@ -43,7 +42,7 @@ from robotdiffuse.problems.moveit import (
     moveit_scene,
     scene_robot_notes,
 )
-from robotdiffuse.problems.problem import Problem, moved
+from robotdiffuse.problems.problem import Goal, JointGoal, PoseGoal, Problem, moved
 from robotdiffuse.robots import FILE_ENDINGS, ROBOTS, load_robot
 from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
 from robotdiffuse.scenes.files import check_fields, read_scene

@@ -14,8 +14,18 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import numbers, unit_quaternion, vector
-from robotdiffuse.core.errors import InputError, check_name, joined, located, shortened, shown, unknown_name
+from robotdiffuse.core.errors import (
+    InputError,
+    check_name,
+    joined,
+    located,
+    numbers,
+    shortened,
+    shown,
+    unit_quaternion,
+    unknown_name,
+    vector,
+)
 from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import (

@@ -8,9 +8,8 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import MAX_COORDINATE, Value, numbers, read_only, within
-from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.types import GivenVector, Points, Pose, Rotation, Vector
+from robotdiffuse.core.errors import MAX_COORDINATE, InputError, numbers, shown, within
+from robotdiffuse.core.types import GivenVector, Points, Pose, Rotation, Value, Vector, read_only
 
 TOOL = "tool"
 """Default name of a tool."""

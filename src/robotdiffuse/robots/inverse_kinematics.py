@@ -8,10 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Int
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import for_kernels, rigid_transform
-from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.errors import InputError, rigid_transform, shown
 from robotdiffuse.core.settings import Count, Settings
-from robotdiffuse.core.types import Configuration, Configurations, Mask, Pose
+from robotdiffuse.core.types import Configuration, Configurations, Mask, Pose, for_kernels
 from robotdiffuse.robots.ik_kernel import CONTINUOUS, PRISMATIC, REVOLUTE, IKChain, IKParameters, solve_seeds
 from robotdiffuse.robots.kinematic_tree import KinematicTree
 

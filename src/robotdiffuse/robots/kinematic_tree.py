@@ -9,11 +9,20 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import Value, read_only
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.loading import loading
 from robotdiffuse.core.transforms import inverse, moved_spheres, rotation_about, rotation_z_to, transform
-from robotdiffuse.core.types import Configuration, Configurations, JointValues, Pose, Poses, Spheres, Vector
+from robotdiffuse.core.types import (
+    Configuration,
+    Configurations,
+    JointValues,
+    Pose,
+    Poses,
+    Spheres,
+    Value,
+    Vector,
+    read_only,
+)
 
 MOVING_KINDS = ("revolute", "continuous", "prismatic")
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")

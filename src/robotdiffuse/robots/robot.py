@@ -14,9 +14,16 @@ from jaxtyping import Bool
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import MAX_COORDINATE, Value, numbers, within
-from robotdiffuse.core.errors import InputError, check_name, shown, unknown_name
-from robotdiffuse.core.types import Mask, Pose, Spheres, Values
+from robotdiffuse.core.errors import (
+    MAX_COORDINATE,
+    InputError,
+    check_name,
+    numbers,
+    shown,
+    unknown_name,
+    within,
+)
+from robotdiffuse.core.types import Mask, Pose, Spheres, Value, Values
 from robotdiffuse.robots.bodies import (
     TOOL,
     AttachedBody,

@@ -21,8 +21,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import MAX_COORDINATE, MIN_RATE, unit_quaternion, within
-from robotdiffuse.core.errors import InputError, shortened, shown
+from robotdiffuse.core.errors import (
+    MAX_COORDINATE,
+    MIN_RATE,
+    InputError,
+    shortened,
+    shown,
+    unit_quaternion,
+    within,
+)
 from robotdiffuse.core.input_files import is_file, read_arrays, read_json
 from robotdiffuse.core.output_files import lock_folder, write_atomically, write_error
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import Value
+from robotdiffuse.core.types import Value
 from robotdiffuse.robots.robot import Robot
 
 UNIT = 5e-5

@@ -8,8 +8,7 @@ from typing import Any
 
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import MAX_RPY, vector
-from robotdiffuse.core.errors import InputError, check_name, located, shown
+from robotdiffuse.core.errors import MAX_RPY, InputError, check_name, located, shown, vector
 from robotdiffuse.core.input_files import known_ending, read_array
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy

@@ -11,8 +11,17 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import Value, form, numbers, read_only, rigid_transform, vector, within
-from robotdiffuse.core.errors import InputError, distinct, located, shown
+from robotdiffuse.core.errors import (
+    InputError,
+    distinct,
+    form,
+    located,
+    numbers,
+    rigid_transform,
+    shown,
+    vector,
+    within,
+)
 from robotdiffuse.core.transforms import (
     inverse,
     quaternion_from_rotation,
@@ -20,7 +29,16 @@ from robotdiffuse.core.transforms import (
     rotation_from_quaternion,
     transform,
 )
-from robotdiffuse.core.types import ArrayOrNone, Pose, Poses, Values, VectorOrNone, check_increasing
+from robotdiffuse.core.types import (
+    ArrayOrNone,
+    Pose,
+    Poses,
+    Value,
+    Values,
+    VectorOrNone,
+    check_increasing,
+    read_only,
+)
 from robotdiffuse.scenes.shapes import Shape
 
 MAX_POINT_SPEED = 100.0

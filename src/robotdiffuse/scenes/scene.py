@@ -8,10 +8,9 @@ from typing import Any, no_type_check
 
 import numpy as np
 
-from robotdiffuse.core.bounds import Value
 from robotdiffuse.core.errors import InputError, check_name, joined, shown, unknown_name
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation, transform
-from robotdiffuse.core.types import Configuration, Pose
+from robotdiffuse.core.types import Configuration, Pose, Value
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 

@@ -17,22 +17,21 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import (
+from robotdiffuse.core.errors import (
     MAX_COORDINATE,
     MIN_SIZE,
-    Value,
+    InputError,
     form,
     numbers,
     points,
     positive,
-    read_only,
+    shown,
     unit_quaternion,
     vector,
 )
-from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import placed, quaternion_from_rotation, rotation_from_quaternion, transform
-from robotdiffuse.core.types import GivenArray, GivenVector, Points, Pose, Rotation, Values
+from robotdiffuse.core.types import GivenArray, GivenVector, Points, Pose, Rotation, Value, Values, read_only
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.scenes.point_cloud import POINT_RADIUS, default_radius, distinct, read_points, voxel_thin
 

@@ -18,9 +18,8 @@ from robotdiffuse.core import loading
 from robotdiffuse.core.deadline import cancel_check, check_cancelled
 from robotdiffuse.core.errors import InputError, shortened, shown
 from robotdiffuse.core.input_files import MEGABYTE, decoded, parse_json
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import converted
-from robotdiffuse.core.types import RATES, Path, SampleRate, Trajectory, check_motion_arrays
+from robotdiffuse.core.types import RATES, Path, PlanResult, SampleRate, Trajectory, check_motion_arrays
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner

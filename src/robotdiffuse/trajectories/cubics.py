@@ -11,9 +11,16 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.kernels import inner_kernel, kernel
-from robotdiffuse.core.types import Configuration, Configurations, JointRows, JointValues, Trajectory, Values
+from robotdiffuse.core.types import (
+    Configuration,
+    Configurations,
+    JointRows,
+    JointValues,
+    Trajectory,
+    Values,
+    for_kernels,
+)
 
 
 class Extremes(NamedTuple):

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import MIN_RATE
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import MIN_RATE, InputError
 from robotdiffuse.core.types import Configurations, JointValues, Path, Trajectory, Values, interpolated
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.speed_limits import (

@@ -11,7 +11,7 @@ from numpy import ndarray
 from robotdiffuse.core.settings import Bound, Natural, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import inverse, rotation_angle, rpy_from_rotation
 from robotdiffuse.core.types import Configuration, Configurations, JointRows, Pose, Values, interpolated
-from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal
+from robotdiffuse.problems.problem import AnyGoal, Goal, JointGoal, PosesGoal
 from robotdiffuse.robots.robot import Robot
 
 

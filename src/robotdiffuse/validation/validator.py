@@ -15,10 +15,9 @@ from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import describe_contact
 from robotdiffuse.collision.motions import Contact, ContinuousCollision
-from robotdiffuse.core.bounds import MAX_COORDINATE, for_kernels, within
-from robotdiffuse.core.errors import InputError, check_type, distinct, joined, shown
+from robotdiffuse.core.errors import MAX_COORDINATE, InputError, check_type, distinct, joined, shown, within
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.types import ROWS, Path, Trajectory
+from robotdiffuse.core.types import ROWS, Path, Trajectory, for_kernels
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.trajectories.cubics import Cubics
@@ -505,7 +504,7 @@ def violations(
     limits once for each joint; and the first violation of every other kind, also the first contact with a
     moving obstacle. If numbers are not finite, or times are not those of a motion, only this is returned.
     """
-    from robotdiffuse.collision.contacts import contacts  # imported here, since nothing else needs it
+    from robotdiffuse.collision.motions import contacts  # imported here, since nothing else needs it
 
     timed = isinstance(motion, Trajectory)
     report = verify(problem, motion, settings)

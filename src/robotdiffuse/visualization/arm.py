@@ -5,11 +5,11 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.exact_meshes import forward_frames
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import (
     Configuration,
     Configurations,
     Path,
+    PlanResult,
     Points,
     Trajectory,
     Values,

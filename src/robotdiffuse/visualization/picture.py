@@ -14,9 +14,17 @@ from scipy.spatial import ConvexHull
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import check_output, write_atomically
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Natural, NotNegative, Settings
-from robotdiffuse.core.types import Configuration, Configurations, Path, Points, Rotation, Trajectory, Vector
+from robotdiffuse.core.types import (
+    Configuration,
+    Configurations,
+    Path,
+    PlanResult,
+    Points,
+    Rotation,
+    Trajectory,
+    Vector,
+)
 from robotdiffuse.drawables import GOAL, START, Color, Drawable, Surface, drawables, join, painted
 from robotdiffuse.perception.ray_caster import looking_at
 from robotdiffuse.robots.robot import Robot

@@ -20,14 +20,15 @@ from PIL import Image
 
 from robotdiffuse.core.errors import InputError, check_type, shortened
 from robotdiffuse.core.output_files import check_output, write_atomically
-from robotdiffuse.core.results import PlanResult, ResultFile
 from robotdiffuse.core.transforms import IDENTITY, inverse, moved_spheres, quaternion_from_rotation
 from robotdiffuse.core.types import (
     Configuration,
     Configurations,
     Path,
+    PlanResult,
     Points,
     Pose,
+    ResultFile,
     Trajectory,
     Values,
     interpolated,
@@ -46,8 +47,15 @@ from robotdiffuse.drawables import (
 )
 from robotdiffuse.planning.pose_goals import pose_configurations
 from robotdiffuse.problems.files import problem_from_record
-from robotdiffuse.problems.goals import AnyGoal, JointGoal, OneGoal, poses_of
-from robotdiffuse.problems.problem import Problem, StateValidity, check_problem
+from robotdiffuse.problems.problem import (
+    AnyGoal,
+    JointGoal,
+    OneGoal,
+    Problem,
+    StateValidity,
+    check_problem,
+    poses_of,
+)
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene

@@ -18,8 +18,7 @@ from torch import Tensor
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.types import Mask, Values
-from robotdiffuse.datasets.rows import read_rows, turns_about_vertical
-from robotdiffuse.datasets.shards import SPLITS, shard_indices
+from robotdiffuse.datasets.shards import SPLITS, read_rows, shard_indices, turns_about_vertical
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.checkpoint import fingerprint
 from robotdiffuse.learning.encoders.networks import Encoder
@@ -122,8 +121,9 @@ def load_data(
     scenes.
 
     encoder: computes the embeddings; None: there are no embeddings.
-    turned_copies: number of copies of each training row, turned by random angles, see `datasets.rows.turned`;
-        no copies are made if the robot's first joint does not rotate about the vertical.
+    turned_copies: number of copies of each training row, turned by random angles, see
+        `datasets.shards.turned`; no copies are made if the robot's first joint does not rotate about the
+        vertical.
     report: called with messages about the progress.
 
     Embeddings are cached in the data folder, in files named by shard, encoder and turn; if the folder cannot

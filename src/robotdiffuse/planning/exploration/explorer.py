@@ -30,12 +30,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
-from robotdiffuse.core.bounds import vector
-from robotdiffuse.core.errors import InputError, check_type
+from robotdiffuse.core.errors import InputError, check_type, vector
 from robotdiffuse.core.locked import locked
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Natural, converted
-from robotdiffuse.core.types import FIRST, Configuration, Configurations, Path, Status, Trajectory
+from robotdiffuse.core.types import FIRST, Configuration, Configurations, Path, PlanResult, Status, Trajectory
 from robotdiffuse.perception.camera_check import contradiction, implausible
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.occupancy_map import Corners, OccupancyMap, ViewMemory
@@ -77,8 +75,7 @@ from robotdiffuse.planning.exploration.viewpoints import (
 )
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.planning.start_goal import usable_start_goal
-from robotdiffuse.problems.goals import Goal
-from robotdiffuse.problems.problem import PADDED, PREDICTED, JointGoal, Problem
+from robotdiffuse.problems.problem import PADDED, PREDICTED, Goal, JointGoal, Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.tolerances import VerifySettings, goal_error

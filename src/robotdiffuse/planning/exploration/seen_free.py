@@ -17,8 +17,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import reach_ball
 from robotdiffuse.collision.motions import with_covering_spheres
-from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Configuration, Configurations, Path, Points
+from robotdiffuse.core.types import Configuration, Configurations, Path, PlanResult, Points
 from robotdiffuse.perception.depth_filter import MARGIN_SPREADS, filtered
 from robotdiffuse.perception.depth_view import AssumedPoints, DepthView
 from robotdiffuse.perception.observed_volume import usable_image

@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import vector
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Configuration, Configurations, Pose, Trajectory
+from robotdiffuse.core.errors import InputError, vector
+from robotdiffuse.core.types import Configuration, Configurations, PlanResult, Pose, Trajectory
 from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 from robotdiffuse.perception.ray_caster import MAX_RANGE, looking_at, ray_cast
 from robotdiffuse.perception.seen_points import near_scene

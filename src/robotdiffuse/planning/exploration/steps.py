@@ -6,11 +6,9 @@ from typing import Annotated, Any, Literal
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import Value, positive, rigid_transform
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.errors import InputError, positive, rigid_transform
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
-from robotdiffuse.core.types import Configurations, Pose
+from robotdiffuse.core.types import Configurations, PlanResult, Pose, Value
 from robotdiffuse.perception.voxel_grid import Voxels
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene

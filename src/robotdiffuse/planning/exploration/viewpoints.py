@@ -12,10 +12,8 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.core.bounds import Value, rigid_transform
-from robotdiffuse.core.errors import InputError, check_type
-from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Configuration, Configurations, Path, Pose, interpolated
+from robotdiffuse.core.errors import InputError, check_type, rigid_transform
+from robotdiffuse.core.types import Configuration, Configurations, Path, PlanResult, Pose, Value, interpolated
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.occupancy_map import COVER_RADIUS, OccupancyMap

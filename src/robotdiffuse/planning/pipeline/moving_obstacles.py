@@ -24,8 +24,7 @@ from robotdiffuse.collision.kernels.moving_obstacles import free_at_times
 from robotdiffuse.collision.moving_obstacles import MovingCollision, compile_links
 from robotdiffuse.core.deadline import OutOfTimeError, check_timing
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Path, Status, Trajectory
+from robotdiffuse.core.types import Path, PlanResult, Status, Trajectory
 from robotdiffuse.planning.context import PlanningContext, PlanRequest, Solver, least_clearances
 from robotdiffuse.planning.pipeline.waypoints import plan_through_waypoints
 from robotdiffuse.problems.problem import Problem

@@ -25,8 +25,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
-from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import FIRST, Configurations, Status
+from robotdiffuse.core.types import FIRST, Configurations, PlanResult, Status
 from robotdiffuse.perception.camera_check import camera_note
 from robotdiffuse.perception.depth_filter import measured_share
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints

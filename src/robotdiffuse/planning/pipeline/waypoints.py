@@ -24,10 +24,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError, check_type
-from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import ROWS, Path, Status, Trajectory
+from robotdiffuse.core.types import ROWS, Path, PlanResult, Status, Trajectory, for_kernels
 from robotdiffuse.planning.context import (
     MIN_TIME_LIMIT,
     PlanningContext,
@@ -36,8 +34,7 @@ from robotdiffuse.planning.context import (
     least_clearances,
 )
 from robotdiffuse.problems.constraints import CartesianLine
-from robotdiffuse.problems.goals import Goal, JointGoal
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import Goal, JointGoal, Problem
 from robotdiffuse.trajectories.speed_limits import DEFAULT as TIMING
 from robotdiffuse.trajectories.speed_limits import stopping_distance
 from robotdiffuse.trajectories.timing import joined_rows

@@ -26,19 +26,25 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.collision.moving_obstacles import MovingCollision
-from robotdiffuse.core.bounds import numbers, rigid_transform, within
-from robotdiffuse.core.errors import InputError, check_name, check_type, distinct, shown
+from robotdiffuse.core.errors import (
+    InputError,
+    check_name,
+    check_type,
+    distinct,
+    numbers,
+    rigid_transform,
+    shown,
+    within,
+)
 from robotdiffuse.core.locked import locked
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, NotNegative, Settings
 from robotdiffuse.core.transforms import inverse, rotation_angle, transform
-from robotdiffuse.core.types import Configuration, Configurations, Trajectory, Values, Vector
+from robotdiffuse.core.types import Configuration, Configurations, PlanResult, Trajectory, Values, Vector
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.reactive.timed_path import MIN_LENGTH, JerkFilter, SpeedProfile, TimedPath
 from robotdiffuse.planning.search.rrt import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
-from robotdiffuse.problems.goals import Goal
-from robotdiffuse.problems.problem import MAX_CLEARANCE, Problem, check_problem
+from robotdiffuse.problems.problem import MAX_CLEARANCE, Goal, Problem, check_problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.shapes import Shape

@@ -22,9 +22,7 @@ from numpy import ndarray
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import finer_resolution
-from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.loading import loading
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings
 from robotdiffuse.core.types import (
     FIRST,
@@ -33,8 +31,10 @@ from robotdiffuse.core.types import (
     TIME_LIMIT,
     Configuration,
     Configurations,
+    PlanResult,
     Tree,
     Values,
+    for_kernels,
 )
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
 from robotdiffuse.planning.context import DEFAULT_CLEARANCE, TOLERANCE_FRACTION, PlanningContext
@@ -47,7 +47,7 @@ from robotdiffuse.planning.search.time_optimization import (
     still_improves,
 )
 from robotdiffuse.planning.start_goal import StartGoal
-from robotdiffuse.problems.goals import AnyGoal, JointGoal
+from robotdiffuse.problems.problem import AnyGoal, JointGoal
 from robotdiffuse.trajectories.simplification import simplify, tighten
 from robotdiffuse.trajectories.speed_limits import scaled_limits
 

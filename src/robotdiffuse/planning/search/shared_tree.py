@@ -40,9 +40,8 @@ from robotdiffuse.collision.kernels.motions import (
 )
 from robotdiffuse.collision.kernels.random import random, random_state
 from robotdiffuse.core.kernels import allocation_free, kernel
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, NotNegative, Positive, Settings
-from robotdiffuse.core.types import Configuration, Configurations, Values
+from robotdiffuse.core.types import Configuration, Configurations, PlanResult, Values
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner, ever_finer
 from robotdiffuse.planning.search import rrt_kernel

@@ -19,9 +19,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.transforms import ball_around
-from robotdiffuse.core.types import Configurations, Mask, Poses, Spheres, Values, Vector
+from robotdiffuse.core.types import Configurations, Mask, Poses, Spheres, Values, Vector, for_kernels
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import ball_distances, deepest_touches
 from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, TURN, Joint, with_mimics

@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import for_kernels
-from robotdiffuse.core.types import Points, Spheres, Values
+from robotdiffuse.core.types import Points, Spheres, Values, for_kernels
 from robotdiffuse.robots.coal_geometry import coal_pose, coal_surface
 from robotdiffuse.robots.fitting.convex_parts import Surface, one_per_cube
 from robotdiffuse.robots.fitting.sampled_links import NEAR_DISTANCE, Links

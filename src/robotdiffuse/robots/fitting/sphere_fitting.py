@@ -25,8 +25,7 @@ from numpy import ndarray
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from robotdiffuse.core.bounds import for_kernels
-from robotdiffuse.core.types import Mask, Points, Spheres, Values, Vector
+from robotdiffuse.core.types import Mask, Points, Spheres, Values, Vector, for_kernels
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_parts import planes_of
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import (

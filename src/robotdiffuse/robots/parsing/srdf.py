@@ -12,8 +12,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import NamedTuple
 
-from robotdiffuse.core.bounds import MAX_COORDINATE
-from robotdiffuse.core.errors import InputError, check_name, repeated, shown, unknown_name
+from robotdiffuse.core.errors import MAX_COORDINATE, InputError, check_name, repeated, shown, unknown_name
 from robotdiffuse.core.input_files import is_file, parse_xml, read_bytes
 from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, Joint, chain
 from robotdiffuse.robots.robot import Robot

@@ -12,16 +12,21 @@ import numpy as np
 import trimesh
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import (
+from robotdiffuse.core.errors import (
     MAX_COORDINATE,
     MAX_RATE,
     MIN_RATE,
     MIN_SIZE,
+    InputError,
+    check_name,
+    joined,
+    located,
     points,
+    repeated,
+    shown,
     unit_quaternion,
     within,
 )
-from robotdiffuse.core.errors import InputError, check_name, joined, located, repeated, shown
 from robotdiffuse.core.input_files import parse_xml, read_bytes, read_yaml
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import (

@@ -35,8 +35,7 @@ from robotdiffuse.planning.exploration.steps import (
     STRICT,
     ExplorerSettings,
 )
-from robotdiffuse.problems.goals import JointGoal
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.visualization.arm import DrawnArm
 from robotdiffuse.visualization.exploration import (
     LOOK_COLOR,

@@ -20,17 +20,15 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP
 from robotdiffuse.core.errors import InputError, check_name, shortened, unknown_name
 from robotdiffuse.core.input_files import decoded, parse_json, parse_yaml
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, OneOf, Settings
 from robotdiffuse.core.transforms import inverse, transform
-from robotdiffuse.core.types import Configuration, Pose, Vector
+from robotdiffuse.core.types import Configuration, PlanResult, Pose, Vector
 from robotdiffuse.drawables import own_frame
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.files import WRITERS, load_problem, problem_from_record, problem_record
-from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal, poses_of
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal, Problem, poses_of
 from robotdiffuse.robots import known_robots, load_robot
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.robot import Robot
