@@ -1,5 +1,7 @@
 """Planning without PyTorch: every planner but MPNet and MPiNets, views, certificates."""
 
+import pytest
+
 from helpers.commands import python
 
 BLOCKED = """
@@ -8,43 +10,25 @@ time.perf_counter = time.process_time  # limits do not depend on what else runs
 sys.modules["torch"] = None  # importing it raises ImportError
 import numpy as np
 import robotdiffuse as rd
+from robotdiffuse.cli import main
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 
 robot = rd.load_robot("panda")
 start, goal = (np.array([turn, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785]) for turn in (0.9, -0.9))
 scene = rd.Scene([rd.Sphere([0.5, 0.0, 0.4], 0.15)])
 problem = rd.Problem(robot, scene, start, rd.JointGoal(goal[None]))
-"""
-
-
-def test_plans_and_certifies_and_the_default_planner_loads_no_network() -> None:
-    code = """
 print(rd.plan(problem, time_limit=10.0).solved, "onnxruntime" in sys.modules)
 for name in ("robotdiffuse", "diffusion", "mpd", "edmp"):
     result = rd.load_planner(name).plan(problem, time_limit=60.0)
     print(name, result.solved, rd.verify(problem, result.path).valid)
     assert result.solved, result.reason
 print("certified", rd.certify(problem, result.trajectory) is not None)
-"""
-    said = python(BLOCKED + code).stdout.splitlines()
-    assert said[0] == "True False"
-    assert said[1:5] == [f"{name} True True" for name in ("robotdiffuse", "diffusion", "mpd", "edmp")]
 
-
-def test_plans_in_a_scene_that_a_camera_saw_with_predicted_unknown_space() -> None:
-    code = """
 T = looking_at(np.array([-1.2, 0.4, 1.0]), np.array([0.4, 0.0, 0.3]))
 view = ray_cast(scene, T, (120.0, 120.0, 79.5, 59.5), (160, 120), robot, start)
 seen = rd.Problem(robot, rd.Scene(), start, rd.JointGoal(goal[None]), views=[view], unknown="predicted")
 result = rd.plan(seen, time_limit=60.0)
 print(result.solved, result.assumption != "", 0 < result.confidence <= 1)
-"""
-    assert python(BLOCKED + code).stdout == "True True True\n"
-
-
-def test_what_needs_pytorch_says_how_to_install_it() -> None:
-    code = """
-from robotdiffuse.cli import main
 for name in ("mpnet", "mpinets"):
     try:
         rd.load_planner(name).plan(problem)
@@ -52,7 +36,24 @@ for name in ("mpnet", "mpinets"):
         print(error)
 print(main(["train", "encoder", "--out", "nowhere"]))
 """
-    said = python(BLOCKED + code).stdout.splitlines()
-    for name, line in zip(("mpnet", "mpinets"), said, strict=False):
+
+
+@pytest.fixture(scope="module")
+def said() -> list[str]:
+    return python(BLOCKED).stdout.splitlines()
+
+
+def test_plans_and_certifies_and_the_default_planner_loads_no_network(said: list[str]) -> None:
+    assert said[0] == "True False"
+    planned = [f"{name} True True" for name in ("robotdiffuse", "diffusion", "mpd", "edmp")]
+    assert said[1:6] == [*planned, "certified True"]
+
+
+def test_plans_in_a_scene_that_a_camera_saw_with_predicted_unknown_space(said: list[str]) -> None:
+    assert said[6] == "True True True"
+
+
+def test_what_needs_pytorch_says_how_to_install_it(said: list[str]) -> None:
+    for name, line in zip(("mpnet", "mpinets"), said[7:9], strict=True):
         assert line == f'the planner {name} needs torch, not installed: pip install "robotdiffuse[train]"'
-    assert said[2] == "2"
+    assert said[9] == "2"
