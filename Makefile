@@ -50,7 +50,8 @@ test: .venv/dev.stamp
 
 # on a new machine, before the tests: each process of the tests would compile for itself what all of them call
 compiled: .venv/dev.stamp
-	set -e; work=$$(mktemp -d); here=$$PWD; cd $$work; $$here/$(BIN)/robotdiffuse demo >/dev/null; rm -r $$work
+	set -e; work=$$(mktemp -d); here=$$PWD; cd $$work; $$here/$(BIN)/robotdiffuse demo >/dev/null; \
+		$$here/$(BIN)/robotdiffuse plan $$here/examples/upright_cup.yaml --planner aorrtc >/dev/null; rm -r $$work
 
 test-all: .venv/dev.stamp chromium
 	$(BIN)/python -m pytest -n 2 --dist worksteal
