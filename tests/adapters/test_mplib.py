@@ -78,6 +78,19 @@ def test_both_versions_and_objects_with_p_and_q(made: Planner) -> None:
     assert np.allclose(made.plan_qpos([ends[0]], QPOS, planning_time=10.0)["position"][-1], ends[0][:7], atol=1e-6)
 
 
+def test_arguments_of_both_versions(made: Planner) -> None:
+    """Regression: a screw took no arguments of 0.2 and ignored time_step by position; return_closest and None were wrong."""
+    goal = [0.5, 0.2, 0.4, *DOWN]
+    for result in (made.plan_screw(goal, QPOS, 0.1, 0.05), made.plan_screw(target_pose=goal, qpos=QPOS, time_step=0.05)):
+        assert np.allclose(result["time"][:2], [0.05, 0.1])
+    assert made.plan_screw(goal_pose=goal, current_qpos=QPOS, wrt_world=True, verbose=False)["status"] == "Success"
+    assert np.shape(made.IK(goal, QPOS, return_closest=True)[1]) == (9,)
+    unlimited = planner(joint_vel_limits=None, joint_acc_limits=None, srdf=None)
+    assert np.array_equal(unlimited.joint_vel_limits, np.ones(7))
+    with pytest.raises(TypeError, match="joint_vel_limit'"):
+        planner(joint_vel_limit=np.full(7, 0.2))
+
+
 def test_a_screw_is_a_straight_line(made: Planner) -> None:
     start = made.workspace.pose(QPOS[:7])
     end = start.copy()
@@ -126,6 +139,9 @@ def test_bad_input() -> None:
     refuses("pose is .*; it must be a homogeneous", planner().update_attached_box, [0.1] * 3, np.zeros((4, 4)))
     refuses("qpos is .*; it must be 9 numbers", planner().plan_pose, [0.5, 0, 0.4, *DOWN], QPOS[:8])
     refuses("qpos is 'ready'; it must be 9 numbers", planner().plan_pose, [0.5, 0, 0.4, *DOWN], "ready")
+    refuses("qpos is .*nan.*; it must be 9 numbers", planner().plan_pose, [0.5, 0, 0.4, *DOWN], np.full(9, np.nan))
+    refuses("unknown option 'tim_step'.*did you mean time_step", planner().plan_pose, [0.5, 0, 0.4, *DOWN], QPOS, tim_step=1)
+    refuses("unknown option 'constraint_function'", planner().plan_qpos, [QPOS], QPOS, constraint_function=print)
     refuses("time_step is 0; it must be", planner().plan_pose, [0.5, 0, 0.4, *DOWN], QPOS, time_step=0)
     refuses("goal_qposes is .*; it must be rows of 9 numbers", planner().plan_qpos, [QPOS, QPOS[:3]], QPOS)
     refuses("count is 0; it must be an integer", planner().IK, [0.5, 0, 0.4, *DOWN], QPOS, n_init_qpos=0)
@@ -134,7 +150,7 @@ def test_bad_input() -> None:
     refuses("acceleration limits are .*; they must be 7 positive", planner, joint_acc_limits=[-1.0] * 7)
     refuses("user_joint_names is 'panda_joint1'; it must be a list", planner, user_joint_names="panda_joint1")
     refuses("urdf missing.urdf does not exist", Planner, "missing.urdf", HAND)
-    refuses("package_keyword_replacement is 'missing'; it must be a folder", Planner, __file__, HAND, "missing")
+    refuses("package_keyword_replacement is 'missing'; it must be a folder", Planner, __file__, HAND, "", "missing")
     refuses("user_joint_names lacks panda_joint1", planner, user_joint_names=JOINTS[1:])
     refuses("unknown link 'nose'", rd.Workspace, planner().robot, "nose")
 

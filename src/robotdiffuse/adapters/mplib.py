@@ -19,7 +19,15 @@ from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from robotdiffuse.core.errors import InputError, check_list, numbers, positive, rigid_transform, shown
+from robotdiffuse.core.errors import (
+    InputError,
+    check_list,
+    check_name,
+    numbers,
+    positive,
+    rigid_transform,
+    shown,
+)
 from robotdiffuse.core.input_files import read_bytes
 from robotdiffuse.core.transforms import inverse, pose, transform
 from robotdiffuse.core.types import PlanResult
@@ -53,6 +61,20 @@ TILT_MARGIN = 1.25
 HELD_JOINT_STEP = 0.002
 # Smallest time between two rows of a motion [s].
 MIN_TIME_STEP = 1e-4
+OPTIONS = (
+    "time_step",
+    "planning_time",
+    "wrt_world",
+    "rrt_range",
+    "fix_joint_limits",
+    "planner_name",
+    "simplify",
+    "no_simplification",
+    "use_point_cloud",
+    "use_attach",
+    "verbose",
+)
+"""Options of MPlib's plans; the first three have an effect. Others, such as constraints, are refused."""
 
 
 class Planner:
@@ -61,15 +83,17 @@ class Planner:
     Args:
         urdf: The robot's URDF, prepared on first use, in about a minute; or the name of a bundled robot.
         move_group: The link that goal poses refer to.
+        srdf: SRDF with pairs of links that need no check; "" or none: these pairs are found by sampling.
         package_keyword_replacement: The folder that replaces `package://` in the URDF.
-        new_package_keyword: Another name for `package_keyword_replacement`.
-        objects: Must be empty; obstacles are added by `workspace.add`.
-        srdf: SRDF with pairs of links that need no check; "": these pairs are found by sampling.
         user_link_names: Ignored: links have the names of the URDF.
         user_joint_names: Joints in the order of `qpos`; none: the planned joints.
         joint_vel_limits: Velocity limits of the planned joints [rad/s]; none: 1, as in MPlib.
         joint_acc_limits: Acceleration limits of the planned joints [rad/s²]; none: those of the robot (MPlib:
             1).
+        new_package_keyword: Another name for `package_keyword_replacement`.
+        objects: Must be empty; obstacles are added by `workspace.add`.
+        use_convex: Ignored: collision geometry is convex.
+        verbose: Ignored.
 
     Raises:
         InputError: For files that cannot be read, unknown links, `user_joint_names` without a planned joint,
@@ -80,15 +104,16 @@ class Planner:
         self,
         urdf: str | Path,
         move_group: str,
+        srdf: str | Path | None = "",
         package_keyword_replacement: str = "",
-        srdf: str | Path = "",
         user_link_names: Sequence[str] = (),
         user_joint_names: Sequence[str] = (),
-        joint_vel_limits: ArrayLike = (),
-        joint_acc_limits: ArrayLike = (),
+        joint_vel_limits: ArrayLike | None = None,
+        joint_acc_limits: ArrayLike | None = None,
         new_package_keyword: str = "",
         objects: Sequence = (),
-        **_: Any,
+        use_convex: bool = False,
+        verbose: bool = False,
     ) -> None:
         if len(objects):
             raise InputError("objects must be empty; add obstacles by `planner.workspace.add(rd.Box(...))`")
@@ -99,11 +124,7 @@ class Planner:
         if missing:
             raise InputError(f"user_joint_names lacks {', '.join(missing)}, which move {move_group}")
         self._places = [self.joint_names.index(name) for name in robot.joint_names]
-        self.robot = _limited(
-            robot,
-            joint_vel_limits if np.size(joint_vel_limits) else np.ones(robot.dof),
-            joint_acc_limits if np.size(joint_acc_limits) else robot.acceleration,
-        )
+        self.robot = _limited(robot, joint_vel_limits, joint_acc_limits)
         self.workspace = Workspace(self.robot, move_group)
         """The robot and its obstacles. Add obstacles other than point clouds by `planner.workspace.add`."""
 
@@ -184,19 +205,25 @@ class Planner:
         return present
 
     def IK(
-        self, goal_pose: Any, start_qpos: ArrayLike, mask: Any = None, n_init_qpos: int = 20, **_: Any
-    ) -> tuple[str, list[ndarray] | None]:
+        self,
+        goal_pose: Any,
+        start_qpos: ArrayLike,
+        mask: Any = None,
+        n_init_qpos: int = 20,
+        return_closest: bool = False,
+        **_: Any,
+    ) -> tuple[str, list[ndarray] | ndarray | None]:
         """Collision-free configurations that reach a pose, the nearest to the start first.
 
         Returns:
-            "Success" and the configurations, or the reason and None.
+            "Success" and the configurations (with `return_closest`, the first one), or the reason and None.
         """
         start = self._start(start_qpos)
         solutions = self.workspace.ik(matrix(goal_pose), near=start, count=n_init_qpos)
         states = [self.workspace.is_free(q) for q in solutions]
         free = [self._qpos(q, start_qpos) for q, state in zip(solutions, states, strict=True) if state]
         if free:
-            return SUCCESS, free
+            return SUCCESS, free[0] if return_closest else free
         why = f"collides: {states[0].reason}" if states else "is out of reach"
         return f"IK Failed! The pose of {self.workspace.tip} {why}", None
 
@@ -210,7 +237,7 @@ class Planner:
             current_qpos: The present joint values, in the order of `user_joint_names`.
             mask: Ignored.
             options: `time_step` [s] between rows (0.1), `planning_time` [s] (1), `wrt_world`; other options
-                of MPlib are ignored.
+                of MPlib are ignored, and constraints are refused.
 
         Returns:
             A dictionary with `status`: "Success", or the reason for the failure. If the plan succeeded, also
@@ -223,20 +250,33 @@ class Planner:
         """Plan to any of several configurations; see `plan_pose`."""
         goals = np.atleast_2d(_array(goal_qposes))
         if goals.ndim > 2 or goals.shape[1] not in (self.robot.dof, len(self.joint_names)):
-            what = f"rows of {len(self.joint_names)} numbers, the values of {', '.join(self.joint_names)}"
-            raise InputError(f"goal_qposes is {shown(goal_qposes)}; it must be {what}")
+            raise InputError(
+                f"goal_qposes is {shown(goal_qposes)}; it must be rows of {len(self.joint_names)} numbers, "
+                f"the values of {', '.join(self.joint_names)}"
+            )
         ends = goals if goals.shape[1] == self.robot.dof else goals[:, self._places]
         plan = partial(self.workspace.plan, JointGoal(ends))
         return self._planned("planning failed", plan, current_qpos, options)
 
-    def plan_screw(self, target_pose: Any, qpos: ArrayLike, *_: Any, **options: Any) -> dict[str, Any]:
+    def plan_screw(
+        self,
+        goal_pose: Any = None,
+        current_qpos: ArrayLike = (),
+        qpos_step: float = 0.1,
+        time_step: float = 0.1,
+        **options: Any,
+    ) -> dict[str, Any]:
         """Move along a straight line while turning at a constant rate; see `plan_pose`.
+
+        `target_pose` and `qpos` are MPlib 0.1's names of the first two arguments; `qpos_step` is ignored.
 
         If there is no such motion, a motion along the line that turns unevenly is tried. If the pose is out
         of reach, but the arm can reach its position when tilted by at most 15 degrees, the motion ends
         there, tilted. In both cases `note` says so.
         """
-        T = self._in_world(target_pose, options)
+        T = self._in_world(options.pop("target_pose", goal_pose), options)
+        qpos = options.pop("qpos", current_qpos)
+        options["time_step"] = time_step
 
         def plan(start: ndarray, **request: Any) -> PlanResult:
             result = self.workspace.plan_line(T, start, **request)
@@ -276,6 +316,9 @@ class Planner:
         """A planned motion as MPlib returns it, with a row every `time_step`. The first row is one step after
         the start. The last row is repeated for SETTLING_TIME, since scripts grasp and release right after
         the motion."""
+        for name, value in options.items():
+            if value is not None:
+                check_name("option", name, OPTIONS)
         start = self._start(qpos)
         step = options.get("time_step", 0.1)
         if positive("options", "time_step", step) < MIN_TIME_STEP:
@@ -325,10 +368,10 @@ class Planner:
         q = np.ravel(_array(qpos))
         if len(q) == self.robot.dof:
             return q
-        if len(q) != len(self.joint_names):
-            names = ", ".join(self.joint_names)
+        if len(q) != len(self.joint_names) or not np.isfinite(q).all():
             raise InputError(
-                f"qpos is {shown(qpos)}; it must be {len(self.joint_names)} numbers, the values of {names}"
+                f"qpos is {shown(qpos)}; it must be {len(self.joint_names)} numbers, the values of "
+                f"{', '.join(self.joint_names)}"
             )
         values = dict(zip(self.joint_names, q.tolist(), strict=True))
         robot = self.workspace.robot
@@ -373,7 +416,7 @@ def matrix(value: Any) -> ndarray:
     return pose(flat[:3], wxyz=flat[3:])
 
 
-def _robot(urdf: str | Path, tip: str, srdf: str | Path, package: str) -> Robot:
+def _robot(urdf: str | Path, tip: str, srdf: str | Path | None, package: str) -> Robot:
     """The prepared robot. A URDF with new content is prepared first, and stored in the user's robots."""
     if str(urdf) in ROBOTS:
         return load_robot(str(urdf))
@@ -390,20 +433,25 @@ def _robot(urdf: str | Path, tip: str, srdf: str | Path, package: str) -> Robot:
     return add_robot(urdf, tip=tip, srdf=srdf or None, packages=packages, out=folder).robot
 
 
-def _limited(robot: Robot, velocity: ArrayLike, acceleration: ArrayLike) -> Robot:
-    """The robot with these limits of its planned joints, and the jerk limits that follow from RAMP_TIME."""
-    limits = dict[str, dict[str, float]]()
-    for field, given in (("velocity", velocity), ("acceleration", acceleration)):
-        values = np.ravel(_array(given))
+def _limited(robot: Robot, velocity: ArrayLike | None, acceleration: ArrayLike | None) -> Robot:
+    """The robot with these limits of its planned joints, and the jerk limits that follow from RAMP_TIME.
+    Without limits, velocities are limited to 1, and accelerations as before."""
+    rows = []
+    for field, given, usual in (
+        ("velocity", velocity, np.ones(robot.dof)),
+        ("acceleration", acceleration, robot.acceleration),
+    ):
+        values = np.ravel(_array(usual if given is None or not np.size(given) else given))
         if len(values) != robot.dof or not ((values > 0) & (values < inf)).all():
             raise InputError(
                 f"{field} limits are {shown(given)}; they must be {robot.dof} positive numbers, one for each "
                 "planned joint"
             )
-        for name, value in zip(robot.joint_names, values.tolist(), strict=True):
-            limits.setdefault(name, {})[field] = value
-    for entry in limits.values():
-        entry["jerk"] = entry["acceleration"] / RAMP_TIME
+        rows.append(values.tolist())
+    limits = {
+        name: {"velocity": speed, "acceleration": most, "jerk": most / RAMP_TIME}
+        for name, speed, most in zip(robot.joint_names, *rows, strict=True)
+    }
     joints = tuple(replace(joint, **limits.get(joint.name, {})) for joint in robot.joints)
     return replace(robot, joints=joints)
 
