@@ -33,7 +33,7 @@ def run_list(arguments: Namespace) -> None:
         except InputError as error:
             rows.append((name, None, None, None, None, "", str(error)))
             continue
-        spheres = sum(len(part) for part in robot.spheres.values())
+        spheres = sum(map(len, robot.spheres.values()))
         weights = "no" if weights_for("model", robot) is None else "yes"
         refused = read_source(place).get("refused")
         pairs = len(robot.checked_pairs())
@@ -104,9 +104,8 @@ def print_preparation(report: "AddReport") -> None:
         (", ".join(pair.links), pair.colliding, pair.by_parts, pair.by_spheres)
         for pair in falsely.pairs[:MAX_PAIRS]
     ]
-    parts = sum(link.parts for link in report.links)
     summary = [
-        ("convex parts, spheres", f"{parts}, {report.sphere_count}"),
+        ("convex parts, spheres", f"{sum(link.parts for link in report.links)}, {report.sphere_count}"),
         ("configurations free of self-collision", f"{falsely.free:.1%}"),
         (
             "of these in false collision by convex parts, by spheres",
@@ -126,9 +125,8 @@ def print_preparation(report: "AddReport") -> None:
 def _print_pairs(report: "AddReport") -> None:
     """Print how many pairs of links are checked, how many are allowed for each reason, and where this differs
     from the SRDF."""
-    reasons = Counter(pair.reason for pair in report.pairs)
-    counted = ", ".join(f"{reason} {count}" for reason, count in sorted(reasons.items()))
-    show(Table.pairs("", [("pairs of links", counted)]))
+    reasons = sorted(Counter(pair.reason for pair in report.pairs).items())
+    show(Table.pairs("", [("pairs of links", ", ".join(f"{reason} {count}" for reason, count in reasons))]))
     if report.srdf is None:
         return
     columns = ("link", "link", "by sampling", Column("colliding", "%", ".1f", scale=100.0), "by the SRDF")
@@ -141,10 +139,11 @@ def print_robot(robot: Robot) -> None:
     """Print joints, limits, collision model and notes of a robot."""
     columns = ("joint", Column("kind", left=True), "lower", "upper", "velocity", "accel.", "jerk")
     joints = [(j.name, j.kind, *_range(j), j.velocity, j.acceleration, j.jerk) for j in robot.planned_joints]
-    spheres = sum(len(rows) for rows in robot.spheres.values())
-    meshes = sum(len(link_meshes) for link_meshes in robot.meshes.values())
-    ends = [("tip", tip) for tip in robot.tips] if robot.other_tips else []
-    pairs = [("base", robot.base), *ends] if ends else [("base, tip", f"{robot.base}, {robot.tip}")]
+    spheres = sum(map(len, robot.spheres.values()))
+    meshes = sum(map(len, robot.meshes.values()))
+    pairs = [("base, tip", f"{robot.base}, {robot.tip}")]
+    if robot.other_tips:
+        pairs = [("base", robot.base), *(("tip", tip) for tip in robot.tips)]
     if robot.root not in ("", robot.base):
         at = "on a moving joint" if robot.T_base_root is None else _place(inverse(robot.T_base_root))
         pairs.append((f"base in {robot.root}", at))
@@ -163,6 +162,7 @@ def _range(joint: Joint) -> tuple[float | None, float | None]:
 
 
 def _place(T: Float[ndarray, "4 4"]) -> str:
-    xyz = T[:3, 3]
     wxyz = quaternion_from_rotation(T[:3, :3])
-    return " ".join(["xyz", *(f"{value:g}" for value in xyz), "wxyz", *(f"{value:.4g}" for value in wxyz)])
+    return " ".join(
+        ["xyz", *(f"{value:g}" for value in T[:3, 3]), "wxyz", *(f"{value:.4g}" for value in wxyz)]
+    )

@@ -72,7 +72,7 @@ def reading(file: object) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:  # the readers of formats raise many kinds of errors for damaged files
-        raise InputError(f"{file} is damaged: {type(error).__name__}: {str(error)[:MAX_WORD]}") from None
+        raise InputError(f"{file} is damaged: {described(error)}") from None
 
 
 @contextmanager
@@ -125,16 +125,22 @@ def shown(value: object) -> str:
     return shortened(text)
 
 
-def shortened(text: str) -> str:
-    """Text from a file or a user as one printable line of at most MAX_QUOTE characters."""
-    text = " ".join(_printable(text).split())
-    return text if len(text) <= MAX_QUOTE else text[: MAX_QUOTE - 3] + "..."
+def shortened(text: object, most: int = MAX_QUOTE) -> str:
+    """Text from a file or a user as one printable line of at most `most` characters."""
+    text = " ".join(_printable(str(text)).split())
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
+def described(error: BaseException) -> str:
+    """The kind and the message of another library's error as one line. It may be long, since such messages
+    often name the file, line or element that is wrong at their end."""
+    return f"{type(error).__name__}: {shortened(error, MAX_WORD)}"
 
 
 def joined(names: Iterable[object], most: int = MAX_NAMES) -> str:
     """Names from a user's input as one line: the first `most`, each shortened, and the number of the
     others."""
-    short_names = [shortened(str(name)) for name in names]
+    short_names = [shortened(name) for name in names]
     more = f" and {len(short_names) - most} more" if len(short_names) > most else ""
     return ", ".join(short_names[:most]) + more
 

@@ -22,7 +22,16 @@ import numpy as np
 import yaml
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, check_name, check_type, reading, repeated, shortened, shown
+from robotdiffuse.core.errors import (
+    MAX_WORD,
+    InputError,
+    check_name,
+    check_type,
+    reading,
+    repeated,
+    shortened,
+    shown,
+)
 
 MEGABYTE = 2**20
 MAX_FILE_SIZE = 256 * MEGABYTE
@@ -30,8 +39,6 @@ MAX_YAML_SIZE = 16 * MEGABYTE
 """Largest size of a YAML file [bytes]. Parsing it takes ten seconds, JSON of this size less than one."""
 MAX_DEPTH = 64
 """Deepest nesting of lists and mappings."""
-MAX_SHOWN_NAME = 300
-"""Longest file name that a message shows in full [characters]."""
 MAX_VALUES = 2_000_000
 """Largest number of values in a YAML file after its aliases are expanded."""
 MAX_DIGITS = 30
@@ -89,8 +96,7 @@ def input_file(file: str | Path, what: str = "", largest: int = MAX_FILE_SIZE) -
     Raises InputError if the file is missing, not regular (a folder, a device, a pipe), too large or not
     readable, if no file can have this name, and within `no_files`.
     """
-    text = str(file_name(file, what or "file"))
-    named = f"{what} {text if len(text) <= MAX_SHOWN_NAME else shortened(text)}".strip()
+    named = f"{what} {shortened(file_name(file, what or 'file'), MAX_WORD)}".strip()
     if _closed.get():
         raise InputError(f"{named} is a file, and files are not read here: give its content instead")
     try:
@@ -237,7 +243,7 @@ def parse_xml(text: bytes, where: str) -> ET.Element:
     except (ET.ParseError, ValueError, LookupError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{where} is not well-formed XML: {shortened(str(error))}") from None
+        raise InputError(f"{where} is not well-formed XML: {shortened(error, MAX_WORD)}") from None
     return events[0][1]
 
 
@@ -342,7 +348,7 @@ def _reason(error: yaml.YAMLError) -> str:
     if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
         mark = error.problem_mark
         return f"{shortened(error.problem or '')} in line {mark.line + 1}, column {mark.column + 1}"
-    return shortened(str(error))
+    return shortened(error, MAX_WORD)
 
 
 def _object(pairs: list[tuple[str, Any]], where: str) -> dict[str, Any]:

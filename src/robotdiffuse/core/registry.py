@@ -13,7 +13,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, NamedTuple
 
-from robotdiffuse.core.errors import InputError, shortened, unknown_name
+from robotdiffuse.core.errors import InputError, described, unknown_name
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,8 @@ class Registry(dict[str, Entry]):
         try:
             entry = point.load()
         except Exception as error:  # an import may raise anything
-            why = f"{type(error).__name__}: {shortened(str(error))}"
             raise InputError(
-                f"{self.what} {name}: its entry point {point.value} cannot be loaded: {why}"
+                f"{self.what} {name}: its entry point {point.value} cannot be loaded: {described(error)}"
             ) from None
         if not isinstance(entry, Entry):
             kind = type(entry).__name__
@@ -227,6 +226,5 @@ def import_modules(names: Iterable[str]) -> None:
         try:
             import_module(name)
         except Exception as error:  # an import may raise anything
-            why = f"{type(error).__name__}: {shortened(str(error))}"
-            raise InputError(f"module {name!r} cannot be imported: {why}") from None
+            raise InputError(f"module {name!r} cannot be imported: {described(error)}") from None
         imported.append(name)

@@ -198,9 +198,7 @@ class Settings:
         fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
         for name in values:
             if name not in fields:
-                raise InputError(
-                    f"{where}.{shortened(str(name))} is not a setting; known: {', '.join(fields)}"
-                )
+                raise InputError(f"{where}.{shortened(name)} is not a setting; known: {', '.join(fields)}")
         checked: dict[str, Any] = {}
         for name, field in fields.items():
             if name in values:

@@ -16,7 +16,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import nn
 
-from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.core.errors import InputError, described
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.learning.completion_network import CompletionNetwork
 from robotdiffuse.learning.encoders import ENCODERS, encoder_name
@@ -92,7 +92,7 @@ def _load(name: str, folder: FilePath) -> Any:
     except (RuntimeError, TypeError, MemoryError, OverflowError) as error:
         # PyTorch's errors for impossible sizes
         raise InputError(
-            f"{location}: no network can be made from these settings: {shortened(str(error))}"
+            f"{location}: no network can be made from these settings: {described(error)}"
         ) from None
     try:
         network.load_state_dict(load(data))

@@ -25,7 +25,7 @@ from robotdiffuse.core.errors import (
     MAX_COORDINATE,
     MIN_RATE,
     InputError,
-    shortened,
+    described,
     shown,
     unit_quaternion,
     within,
@@ -135,7 +135,7 @@ def _damage(file: Path) -> Iterator[None]:
     try:
         yield
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise InputError(f"{file} is damaged: {type(error).__name__}: {shortened(str(error))}") from None
+        raise InputError(f"{file} is damaged: {described(error)}") from None
 
 
 def _digest(robot: Robot) -> str:

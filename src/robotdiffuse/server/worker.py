@@ -16,7 +16,7 @@ import orjson
 
 from robotdiffuse.core import loading
 from robotdiffuse.core.deadline import cancel_check, check_cancelled
-from robotdiffuse.core.errors import InputError, shortened, shown
+from robotdiffuse.core.errors import InputError, described, shown
 from robotdiffuse.core.input_files import MEGABYTE, decoded, parse_json
 from robotdiffuse.core.settings import converted
 from robotdiffuse.core.types import RATES, Path, PlanResult, SampleRate, Trajectory, check_motion_arrays
@@ -137,7 +137,7 @@ def _answer_of(endpoint: str, body: bytes) -> Answer:
         return failed(TOO_LARGE, f"the request needs more memory than a worker may use, {limit_text}")
     except BaseException as error:  # the server would raise a planner's SystemExit again, in its event loop
         traceback.print_exc(file=sys.stderr)
-        return failed(500, f"{type(error).__name__}: {shortened(str(error))}")
+        return failed(500, described(error))
 
 
 def _raise_if_cancelled() -> None:

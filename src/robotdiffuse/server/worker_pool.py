@@ -11,7 +11,7 @@ from math import ceil
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
-from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.core.errors import InputError, described
 from robotdiffuse.processes.workers import EndedError, OverrunError, Workers
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.server import worker
@@ -113,7 +113,7 @@ class WorkerPool:
         except EndedError:
             return failed(500, "the worker process died on this request, or was killed")
         except Exception as error:  # such as a reply that cannot be pickled
-            return failed(500, f"{type(error).__name__}: {shortened(str(error))}")
+            return failed(500, described(error))
         self._request_seconds += 0.1 * (answer.seconds - self._request_seconds)
         return answer
 

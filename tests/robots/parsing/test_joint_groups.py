@@ -92,6 +92,13 @@ def test_names_of_arms(first: str, second: str, names: str, tmp_path: Path) -> N
     refuses(f"2 arms: {names}", read_urdf, written(tmp_path, chain("base", row(first, 6)), chain("base", row(second, 6))))
 
 
+def test_two_arms_and_a_head_on_a_torso_are_no_hand(tmp_path: Path) -> None:
+    """A torso of six joints was planned, and both arms were held as its fingers."""
+    branches = (chain("j6_link", row(side, 7)) for side in ("left_", "right_"))
+    file = written(tmp_path, ARM, *branches, chain("j6_link", ["pan", "tilt"]))
+    refuses("has 2 arms: left .13 joints to left_7_link., right ", read_urdf, file)
+
+
 def test_published_arms_end_where_their_grippers_begin(tmp_path: Path) -> None:
     pytest.importorskip("pinocchio")
     data = urdf_file("panda", tmp_path).parents[2]
@@ -122,7 +129,11 @@ def test_mimic_joints_follow(tmp_path: Path) -> None:
 def test_mimics_of_planned_joints_raise_unless_they_are_locked(tmp_path: Path) -> None:
     follow = '<mimic joint="j2" multiplier="-1"/>'
     bar = link("bar") + joint("rod", "j1_link", "bar", more=follow)
-    refuses(r"rod mimics j2, which is planned; .*--lock j2=VALUE", read_urdf, written(tmp_path, ARM, bar))
+    refuses(
+        r"rod mimics j2, which is planned; .*--lock j2=VALUE.*, or remove rod and what it carries",
+        read_urdf,
+        written(tmp_path, ARM, bar),
+    )
     held = read_urdf(written(tmp_path, ARM, bar), locked={"j2": 0.5})
     assert held.locked == {"rod": -0.5, "j2": 0.5} and held.dof == 5
     bare = bar.replace(link("bar"), link("bar", ""))

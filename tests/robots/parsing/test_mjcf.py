@@ -186,7 +186,7 @@ BODY = "<mujoco><worldbody><body>{}<geom size='1'/></body></worldbody></mujoco>"
         (BODY.format("<joint/><joint name='b' type='ball'/>"), "joint b is a ball joint; use three hinges"),
         (BODY.format("<joint/><geom type='sdf' mesh='m'/>"), "is no valid MuJoCo model"),
         ("<mujoco><worldbody><body><joint", "is not well-formed XML"),
-        ("<mujoco><worldbody><box/></worldbody></mujoco>", "is no valid MuJoCo model"),
+        ("<mujoco><worldbody><box/></worldbody></mujoco>", "no valid MuJoCo model: .*Element .box., line 1$"),
         ("<mujoco><asset><mesh name='m' file='none.stl'/></asset></mujoco>", "none.stl.*; meshes are STL"),
     ],
 )

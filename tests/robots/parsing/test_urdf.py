@@ -235,6 +235,12 @@ def test_quaternions_of_joints_turn_what_follows(tmp_path: Path) -> None:
     np.testing.assert_allclose(first, second, atol=1e-12)
 
 
+def test_limits_of_continuous_joints_are_ignored(tmp_path: Path) -> None:
+    """Regression: propellers and wheels with limits of 1e16 or inf were refused."""
+    parts = chain("base", ["j"], kind="continuous", limits='lower="-1e+16" upper="inf"')
+    assert read_urdf(written(tmp_path, parts)).upper == [CONTINUOUS_LIMIT]
+
+
 def test_soft_limits_are_noted(tmp_path: Path) -> None:
     soft = '<safety_controller k_velocity="20" soft_lower_limit="-1" soft_upper_limit="1"/>'
     [note] = read_urdf(written(tmp_path, chain("base", ["j"], more=soft))).notes
@@ -391,7 +397,10 @@ def test_packages_by_option_environment_and_upwards(tmp_path: Path, monkeypatch:
             patch.setenv(variable, f"/nowhere:{folder}")
             assert "end" in read_urdf(file).meshes
     (far / "urdf").mkdir()
-    assert "end" in read_urdf(written(far / "urdf", PARTS)).meshes
+    file = written(far / "urdf", PARTS)
+    assert "end" in read_urdf(file).meshes
+    (far / "meshes" / "box.stl").unlink()
+    refuses(f"does not exist .the package is {far}.; give", read_urdf, file)
 
 
 def xacro(folder: Path, content: str, name: str = "made.urdf.xacro") -> Path:

@@ -16,7 +16,7 @@ import trimesh
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, needs, shortened
+from robotdiffuse.core.errors import MAX_WORD, InputError, needs, shortened
 from robotdiffuse.core.transforms import (
     inverse,
     quaternion_from_rotation,
@@ -58,9 +58,9 @@ def compiled_model(path: Path) -> Any:
         spec.compiler.fusestatic = False  # bodies without joints are links, too
         return spec.compile()
     except Exception as error:  # MuJoCo raises several kinds of errors for a damaged model
-        text = str(error)
-        remedy = "; meshes are STL, OBJ or MSH files in its meshdir" if "file" in text.lower() else ""
-        raise InputError(f"{path} is no valid MuJoCo model: {shortened(text)}{remedy}") from None
+        text = shortened(error, MAX_WORD)
+        remedy = "; meshes are STL, OBJ or MSH files in its meshdir" * text.startswith("Error: Error opening")
+        raise InputError(f"{path} is no valid MuJoCo model: {text}{remedy}") from None
 
 
 def robot_bodies(model: Any) -> list[int]:
@@ -222,12 +222,9 @@ class ConvertedModel:
         kind = "prismatic" if slides else "revolute" if limited else "continuous"
         element = self._element(label, kind, parent, child, T)
         ET.SubElement(element, "axis", xyz=_text(model.jnt_axis[joint]))
-        limits: dict[str, str] = {}
+        limits = {"effort": repr(self._effort(joint))}
         if limited:
             limits |= zip(("lower", "upper"), map(repr, model.jnt_range[joint].tolist()), strict=True)
-        effort = self._effort(joint)
-        if effort > 0:
-            limits["effort"] = repr(effort)
         ET.SubElement(element, "limit", limits)
         if joint in self.mimics:
             ET.SubElement(element, "mimic", self.mimics[joint])

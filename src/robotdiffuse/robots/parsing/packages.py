@@ -8,7 +8,7 @@ from threading import Lock
 from typing import Any, NamedTuple
 from urllib.parse import unquote
 
-from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.errors import MAX_WORD, InputError, shortened, shown
 from robotdiffuse.core.input_files import is_file
 
 MAX_PACKAGES = 32
@@ -60,12 +60,10 @@ class Packages(NamedTuple):
         if filename.startswith("package://"):
             package, _, rest = filename.removeprefix("package://").partition("/")
             folder = self.folder(package)
-            places = [] if folder is None else [folder]
+            places = [folder or start]
             places += (up / below for up in (start, *start.parents) for below in (package, ""))
-            advice = (
-                f" (searched from {start} upwards); give the package's folder: --package {package}=FOLDER, "
-                f"or ROS_PACKAGE_PATH"
-            )
+            where = f"the package is {folder}" if folder else f"searched from {start} upwards"
+            advice = f" ({where}); give the package's folder: --package {package}=FOLDER, or ROS_PACKAGE_PATH"
         else:
             rest = filename.removeprefix("file://")
             places = [start]
@@ -74,7 +72,7 @@ class Packages(NamedTuple):
             for name in (rest, unquote(rest)):
                 if is_file(place / name):
                     return place / name
-        raise InputError(f"{self.urdf}: mesh file {shown(filename)} does not exist{advice}")
+        raise InputError(f"{self.urdf}: mesh file '{shortened(filename, MAX_WORD)}' does not exist{advice}")
 
 
 def _folders(variable: str) -> list[Path]:

@@ -176,7 +176,10 @@ MAX_HAND_FINGER_JOINTS = 3
 """Largest number of independent joints per finger of a gripper with another number of fingers."""
 MIN_ARM_JOINTS = 4
 """Chains with fewer own joints (see `Arm.own_joints`) count as arms only if no chain has as many. After this
-many own joints, three or more branches form a hand, with any number of joints per finger."""
+many own joints, three or more branches form a hand, with any number of joints per finger; but one or two
+branches with at least LIMB_JOINTS joints are arms, as those of a torso that carries a head too."""
+LIMB_JOINTS = 6
+"""Smallest number of independent joints of arms on a torso."""
 
 
 class Arm(NamedTuple):
@@ -262,7 +265,8 @@ class JointTree:
             return bool(jaw) and lengths[0] <= MAX_HAND_FINGER_JOINTS
         if len(branches) == 2:
             return max(lengths) <= MAX_FINGER_JOINTS
-        return len(branches) > 2 and (max(lengths) <= MAX_HAND_FINGER_JOINTS or own_joints >= MIN_ARM_JOINTS)
+        hand = own_joints >= MIN_ARM_JOINTS and sum(length >= LIMB_JOINTS for length in lengths) not in (1, 2)
+        return len(branches) > 2 and (max(lengths) <= MAX_HAND_FINGER_JOINTS or hand)
 
     def _deepest(self, link: str) -> str:
         """The deepest link below a link."""
@@ -285,17 +289,15 @@ def planned_joints(
     if tip is not None and tip not in (base, *above):
         raise unknown_name(f"tip link below {base} in {file.name}", tip, [base, *above])
     chosen: list[str] | None = None
-    if group is not None and group in srdf.groups:
+    tips = [tip] if tip else []
+    if group in srdf.groups:
         chosen = [joint.name for joint in srdf.joints(group, tuple(joints))]
         if not chosen:
             raise InputError(f"{srdf.path}: group {group} has no movable joint below {base}")
-        tips = _ends(chosen, above, srdf.tips(group)) if tip is None else [tip]
-    elif group is not None or tip is None:
-        arms = JointTree(base, joints).arms()
-        selected_arms = _chosen_arms(file, arms, group, [*srdf.groups])
-        tips = [tip] if tip else [arm.tip for arm in selected_arms] or [base]
-    else:
-        tips = [tip]
+        tips = tips or _ends(chosen, above, srdf.tips(group))
+    elif group is not None or not tip:
+        arms = _chosen_arms(file, JointTree(base, joints).arms(), group, [*srdf.groups])
+        tips = tips or [arm.tip for arm in arms] or [base]
     leading = [joint for end in tips for joint in chain(above, end) if joint.kind in MOVING_KINDS]
     not_leading = [name for name in chosen or () if name not in {joint.name for joint in leading}]
     if not_leading:
@@ -334,7 +336,8 @@ def refuse_linkages(file: Path, robot: Robot) -> None:
         if any(joint in robot.joints_above(link) for link in (*robot.meshes, *robot.tips)):
             raise InputError(
                 f"{file}: joint {joint.name} mimics {leader.name}, which is planned; that is not supported: "
-                f"hold {leader.name} with --lock {leader.name}=VALUE, or end the arm above it with --tip"
+                f"hold {leader.name} with --lock {leader.name}=VALUE, end the arm above it with --tip, or "
+                f"remove {joint.name} and what it carries, which is then not checked"
             )
 
 

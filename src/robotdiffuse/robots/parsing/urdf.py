@@ -164,6 +164,8 @@ class UrdfTree:
                     f" ({', '.join(roots[:5])}); connect them with fixed joints"
                     if roots
                     else ": the joints form a loop; remove one"
+                    if self.links
+                    else ": it has no links; if it only defines macros, add a xacro file that uses them"
                 )
             )
         self.root = roots[0]
@@ -339,16 +341,14 @@ class UrdfTree:
         while end in self.parents:
             joints.insert(0, self.parents[end])
             end = self.ends[joints[0]][0]
-        bare = [self.links[self.root].find(kind) is None for kind in ("collision", "visual")]
         for k, name in enumerate(joints, 1):
-            if not all(bare):
+            parent, child = self.ends[name]
+            if any(self.links[parent].find(kind) is not None for kind in ("collision", "visual")):
                 break
-            child = self.ends[name][1]
-            if self.elements[name].get("type") in ("planar", "floating"):
+            if self.elements[name].get("type") in ("planar", "floating") or moves_in_a_plane(
+                [self._joint(joint) for joint in joints[:k]]
+            ):
                 return child
-            if moves_in_a_plane([self._joint(joint) for joint in joints[:k]]):
-                return child
-            bare += [self.links[child].find(kind) is None for kind in ("collision", "visual")]
         return self.root
 
     def _joint(self, name: str) -> Joint:
@@ -401,31 +401,31 @@ class UrdfTree:
         if self.elements[leaders[-1]].get("type") == "fixed":
             self.notes.append(f"joint {name} mimics the fixed joint {leaders[-1]}; treated as independent")
             return None
-        location = f"joint {name}: mimic"
-        multiplier = self._numbers(followed.get("multiplier", "1"), 1, f"{location} multiplier")
-        offset = self._numbers(followed.get("offset", "0"), 1, f"{location} offset")
+        multiplier = self._numbers(followed.get("multiplier", "1"), 1, f"joint {name}: mimic multiplier")
+        offset = self._numbers(followed.get("offset", "0"), 1, f"joint {name}: mimic offset")
         return Mimic(leaders[1], float(multiplier[0]), float(offset[0]))
 
     def _with_limits(self, joint: Joint, limit: ET.Element | None) -> Joint:
-        attributes = {} if limit is None else limit.attrib
-        limits = {
-            name: float(self._numbers(attributes[name], 1, f"joint {joint.name}: {name} limit", most)[0])
-            for name, most in (("lower", MAX_COORDINATE), ("upper", MAX_COORDINATE), ("velocity", MAX_RATE))
-            if name in attributes
-        }
+        attributes = {} if limit is None else {**limit.attrib}
         if joint.kind == "continuous":
-            limits |= {"lower": -CONTINUOUS_LIMIT, "upper": CONTINUOUS_LIMIT}
-        if "lower" not in limits and "upper" not in limits:
+            attributes |= {"lower": f"-{CONTINUOUS_LIMIT}", "upper": f"{CONTINUOUS_LIMIT}"}
+        limits = {
+            end: float(
+                self._numbers(attributes.get(end, "0"), 1, f"joint {joint.name}: {end} limit", most)[0]
+            )
+            for end, most in (("lower", MAX_COORDINATE), ("upper", MAX_COORDINATE), ("velocity", MAX_RATE))
+        }
+        if not attributes.keys() & {"lower", "upper"}:
             raise InputError(
                 f"{self.path}: joint {joint.name} is {joint.kind} and has no <limit lower= upper=>"
             )
-        lower = limits.get("lower", 0.0)
-        upper = limits.get("upper", 0.0)
+        lower = limits["lower"]
+        upper = limits["upper"]
         if lower > upper:
             raise InputError(
                 f"{self.path}: joint {joint.name}: lower limit {lower} is above upper {upper}; exchange them"
             )
-        velocity = limits.get("velocity", 0.0)
+        velocity = limits["velocity"]
         if 0 < velocity < MIN_RATE:
             raise InputError(
                 f"{self.path}: joint {joint.name}: velocity limit is {velocity:g}; it must be at least "

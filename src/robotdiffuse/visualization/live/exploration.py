@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.core.errors import InputError, described
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Configuration
 from robotdiffuse.drawables import ASSUMED, GOAL, OBSERVED, drawables
@@ -185,9 +185,9 @@ class ExplorationSession:
         except _OutdatedError:
             return
         except Exception as error:  # the page survives any error
-            kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+            failure = str(error) if isinstance(error, InputError) else described(error)
             with suppress(_OutdatedError):
-                self._update(run, phase=ENDED, failure=kind + shortened(str(error)))
+                self._update(run, phase=ENDED, failure=failure)
 
     def _take_steps(self, run: int) -> None:
         state = self._update(run, phase=CHOOSING)

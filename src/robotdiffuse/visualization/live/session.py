@@ -18,7 +18,7 @@ import numpy as np
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP
-from robotdiffuse.core.errors import InputError, check_name, shortened, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, described, unknown_name
 from robotdiffuse.core.input_files import decoded, parse_json, parse_yaml
 from robotdiffuse.core.settings import Bound, OneOf, Settings
 from robotdiffuse.core.transforms import inverse, transform
@@ -330,7 +330,7 @@ class Session:
         except InputError as error:
             return None, str(error), ()
         except Exception as error:  # the page survives any error of a planner
-            return None, f"{options.planner} failed: {type(error).__name__}: {shortened(str(error))}", ()
+            return None, f"{options.planner} failed: {described(error)}", ()
         seconds = [("first path", result.progress[0][0])] if result.progress else []
         seconds += [("planning", result.planning_time)]
         if result.solved:
