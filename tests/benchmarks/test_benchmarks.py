@@ -39,17 +39,12 @@ def test_script_runs(script: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "Python 3" in printed, "no head with machine and versions"
 
 
-@pytest.mark.parametrize("script", SCRIPTS)
-def test_usage_names_the_script(script: str) -> None:
-    assert f"python benchmarks/{script}.py" in (FOLDER / f"{script}.py").read_text()
-
-
-@pytest.mark.parametrize("report", sorted(REPORTS.glob("*.txt")), ids=lambda file: file.name)
-def test_every_report_is_of_a_script(report: Path) -> None:
-    """Its first lines name the script that prints it, or say that this is no longer kept."""
-    first = report.read_text().partition("\n")[0]
-    made_by = [name for name in SCRIPTS if f"benchmarks/{name}.py" in first]
-    assert made_by or NO_SCRIPT in first, first
+def test_usages_and_reports_name_their_scripts() -> None:
+    """The first line of a report names the script that prints it, or says that this is no longer kept."""
+    assert not [name for name in SCRIPTS if f"python benchmarks/{name}.py" not in (FOLDER / f"{name}.py").read_text()]
+    firsts = {file.name: file.read_text().partition("\n")[0] for file in REPORTS.glob("*.txt")}
+    made = (*(f"benchmarks/{name}.py" for name in SCRIPTS), NO_SCRIPT)
+    assert not {name: first for name, first in firsts.items() if not any(by in first for by in made)}
 
 
 def test_the_list_names_every_script_and_every_report() -> None:
