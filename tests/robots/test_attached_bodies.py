@@ -136,10 +136,16 @@ def test_a_tool_is_the_tip_and_its_shapes_are_in_the_frame_of_its_link() -> None
     assert "tool" not in PANDA.with_tool("panda_hand", T_hand_tool).spheres, "a mere frame"
 
 
+def test_a_second_object_of_one_name_is_called_no_link() -> None:
+    part = rd.Box([0.0, 0.0, 0.2], [0.04, 0.04, 0.1], name="part")
+    held = PANDA.attach(part, "panda_hand")
+    refuses("'part', a link or held object of panda; give it another", held.attach, part, "panda_hand")
+
+
 def test_what_cannot_be_held_is_refused_in_one_line() -> None:
     refuses("unknown link in attached.link: 'hand'; known: l1, l2, l3", box_arm().attach, SHAPES[0], "hand")
     refuses("no planned joint moves .*; moved links: l1", box_arm().attach, SHAPES[0], box_arm().base)
-    refuses("is a link of", box_arm().attach, rd.Sphere([0, 0, 0], 0.1, name="l2"), "l3")
+    refuses("'l2', a link or held object of", box_arm().attach, rd.Sphere([0, 0, 0], 0.1, name="l2"), "l3")
     refuses("'point_cloud' is a point_cloud; it must be", box_arm().attach, rd.PointCloud([[0, 0, 0]]), "l3")
     refuses("'tool' already", box_arm().with_tool("l3", np.eye(4)).with_tool, "l3", np.eye(4), name="b")
     refuses("holds ball", box_arm().with_tool("l3", np.eye(4)).attach(SHAPES[0], "tool").detach, "tool")

@@ -401,7 +401,7 @@ class Robot(KinematicTree):
         self.check_moved(f"{field}.link", body.link)
         if body.name in self.link_names:
             raise InputError(
-                f"{field}.name is {body.name!r}, which is a link of {self.name}; give it another name"
+                f"{field}.name is {body.name!r}, a link or held object of {self.name}; give it another name"
             )
         for link in body.touch_links:
             check_name(f"link in {field}.touch_links:", link, self.link_names)
