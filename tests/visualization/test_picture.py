@@ -6,11 +6,11 @@ import numpy as np
 from PIL import Image
 
 from helpers.refusals import refuses
-from robotdiffuse import Path, Scene
+from robotdiffuse import Box, Path, Scene, load_robot
 from robotdiffuse.drawables import drawables
 from robotdiffuse.visualization import PictureSettings, write_comparison, write_picture
 from robotdiffuse.visualization.arm import DrawnArm
-from robotdiffuse.visualization.picture import COMPARED, MARGINS, render, view_of_motion
+from robotdiffuse.visualization.picture import COMPARED, MARGINS, drawn_by, render, view_of_motion
 
 SMALL = PictureSettings(width=320, height=200, ghosts=2)
 
@@ -37,6 +37,18 @@ def test_picture_shows_obstacles_in_their_color(arm, scene, motion):
     column, row, _ = camera.project(np.array([[-0.5, 0.4, 0.5]]))[0].astype(int)
     r, g, b = pixels[row, column].astype(int)
     assert r > g + 25 > b + 25
+
+
+def test_a_wall_that_the_arm_passes_is_not_hidden_behind_the_arm():
+    robot = load_robot("panda")
+    wall = Box([0.55, 0.0, 0.25], [0.3, 0.04, 0.5], name="wall")
+    obstacles = drawables(Scene([Box([0.5, 0.0, -0.05], [0.8, 1.2, 0.1], name="table"), wall]))
+    q = np.tile([robot.poses["ready"][joint] for joint in robot.joint_names], (20, 1))
+    q[:, 0] = np.linspace(-0.6, 0.6, 20)
+    camera = view_of_motion(DrawnArm(robot), obstacles, q, (320, 200), MARGINS)
+    in_front, _, _ = drawn_by(camera, obstacles[1].surface)
+    arm, _, _ = drawn_by(camera, DrawnArm(robot).posed(q[-1]))
+    assert (in_front > arm).sum() > 0.8 * (in_front > 0).sum()
 
 
 def test_several_motions_have_traces_of_their_own_colors(arm, motion, tmp_path):

@@ -132,7 +132,8 @@ def view_of_motion(
     free: tuple[float, float],
     azimuth: float | None = None,
 ) -> Camera:
-    """The framed view that shows most of the arm and its trace along a motion, among AZIMUTHS x ELEVATIONS.
+    """The framed view that shows most of the arm, of its trace along a motion and of the obstacles, among
+    AZIMUTHS x ELEVATIONS.
 
     `among` are the obstacles. `azimuth` fixes the azimuth, measured from the x axis of the base [rad]; None:
     the best one is chosen.
@@ -142,6 +143,7 @@ def view_of_motion(
     ghosts = join([arm.posed(q[i], 1) for i in _earlier(len(q), VIEW_GHOSTS)])
     trace = arm.tool_points(q)
     obstacles = join([obstacle.surface for obstacle in among])
+    owners = np.repeat(np.arange(len(among)), [len(obstacle.surface.faces) for obstacle in among])
     moving = np.concatenate([goal.vertices, ghosts.vertices, trace])
     middle = 0.5 * (moving.min(0) + moving.max(0))
     near = np.linalg.norm(obstacles.vertices - middle, axis=1) < MAX_FRAMING_DISTANCE
@@ -152,7 +154,7 @@ def view_of_motion(
 
     def score(toward: Vector) -> float:
         camera = framed(points, toward, thumbnail_size, free)
-        return _score(camera, goal, ghosts, trace, obstacles)
+        return _score(camera, goal, ghosts, trace, obstacles, owners)
 
     directions = (_direction(angle, elevation) for elevation in ELEVATIONS for angle in around)
     return framed(points, max(directions, key=score), size, free)
@@ -164,14 +166,32 @@ def _earlier(rows: int, count: int) -> list[int]:
     return np.linspace(0, rows - 1, count + 1).round().astype(int).tolist()[:-1] if rows > 1 else []
 
 
-def _score(camera: Camera, arm: Surface, ghosts: Surface, trace: Points, obstacles: Surface) -> float:
+def _score(
+    camera: Camera,
+    arm: Surface,
+    ghosts: Surface,
+    trace: Points,
+    obstacles: Surface,
+    owners: Int[ndarray, "faces"],
+) -> float:
     """Score of a view: the visible fraction of the arm, plus half the visible fraction of the ghosts, plus
-    the visible length of the trace relative to the height of the picture."""
-    obstacle_nearness, _, _ = drawn_by(camera, obstacles)
+    half the mean visible fraction of the obstacles, plus the visible length of the trace relative to the
+    height of the picture.
+
+    owners: the index of the obstacle that each face of `obstacles` belongs to.
+    """
+    obstacle_nearness, faces, _ = drawn_by(camera, obstacles)
+    arm_nearness, _, _ = drawn_by(camera, arm)
+    ghost_nearness, _, _ = drawn_by(camera, ghosts)
     score = 0.0
-    for part, weight in ((arm, 1.0), (ghosts, 0.5)):
-        nearness, _, _ = drawn_by(camera, part)
+    for nearness, weight in ((arm_nearness, 1.0), (ghost_nearness, 0.5)):
         score += weight * float((nearness > obstacle_nearness).sum() / max(1, (nearness > 0).sum()))
+    drawn = obstacle_nearness > 0
+    if drawn.any():
+        count = owners[-1] + 1
+        hidden = np.bincount(owners[faces[drawn & (arm_nearness >= obstacle_nearness)]], minlength=count)
+        shown = np.bincount(owners[faces[drawn & (arm_nearness < obstacle_nearness)]], minlength=count)
+        score += 0.5 * float((shown / np.maximum(1, shown + hidden)).mean())
     pixels = camera.project(trace)
     column = pixels[:, 0].astype(int)
     row = pixels[:, 1].astype(int)
