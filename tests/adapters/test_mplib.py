@@ -84,7 +84,8 @@ def test_arguments_of_both_versions(made: Planner) -> None:
     for result in (made.plan_screw(goal, QPOS, 0.1, 0.05), made.plan_screw(target_pose=goal, qpos=QPOS, time_step=0.05)):
         assert np.allclose(result["time"][:2], [0.05, 0.1])
     assert made.plan_screw(goal_pose=goal, current_qpos=QPOS, wrt_world=True, verbose=False)["status"] == "Success"
-    assert np.shape(made.IK(goal, QPOS, return_closest=True)[1]) == (9,)
+    _, closest = made.IK(goal, QPOS, return_closest=True)
+    assert isinstance(closest, np.ndarray) and closest.shape == (9,)
     unlimited = planner(joint_vel_limits=None, joint_acc_limits=None, srdf=None)
     assert np.array_equal(unlimited.joint_vel_limits, np.ones(7))
     with pytest.raises(TypeError, match="joint_vel_limit'"):

@@ -24,7 +24,7 @@ from trimesh.exchange.ply import export_ply
 from helpers.refusals import refuses
 from robotdiffuse import Box, InputError, Scene
 from robotdiffuse.core import input_files
-from robotdiffuse.core.errors import OutputError, distinct, joined, located, shown, unknown_name
+from robotdiffuse.core.errors import MAX_WORD, OutputError, distinct, joined, located, shown, unknown_name
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.types import check_motion_arrays
 from robotdiffuse.scenes.scene import MAX_CONTACT_LINKS
@@ -164,7 +164,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
         patch.setattr(os, "access", lambda *_: False)  # root may read everything
         assert "permission denied" in one_line(lambda: input_files.input_file(closed))
     long = tmp_path / ("y" * 200)
-    assert str(long) in one_line(lambda: input_files.input_file(long)) or len(str(long)) > input_files.MAX_SHOWN_NAME
+    assert str(long) in one_line(lambda: input_files.input_file(long)) or len(str(long)) > MAX_WORD
 
 
 def test_a_broken_mesh_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -182,6 +182,7 @@ def test_messages_quote_sixty_characters() -> None:
     for value in ("x" * 10**6, [1] * 10**6, 10**5000, np.zeros(10**6), "\x1b[31m\n\ud800", {"a": "b" * 100}):
         assert len(shown(value)) <= 60
         assert shown(value).isprintable()
+    assert shown([np.float64(0.5), (np.int32(-2), np.float32(np.inf))]) == "[0.5, (-2, inf)]"
     inside: list[object] = []
     for _ in range(10**5):
         inside = [inside]

@@ -3,6 +3,7 @@ numbers that users give, which raise it.
 
 The checks convert numbers to arrays within bounds that all other code can handle."""
 
+import re
 from collections import Counter
 from collections.abc import Collection, Hashable, Iterable, Iterator
 from contextlib import contextmanager
@@ -119,7 +120,8 @@ def shown(value: object) -> str:
     if isinstance(value, str | bytes):
         value = value[: MAX_QUOTE + 1]
     try:
-        text = repr(value)
+        # 0.5 in place of np.float64(0.5) in lists
+        text = re.sub(r"np\.(?:u?int|float)\d+\(([^()]*)\)", r"\1", repr(value))
     except (ValueError, RecursionError):  # an integer of too many digits; lists nested too deeply
         text = f"a very long {type(value).__name__}"
     return shortened(text)

@@ -245,6 +245,8 @@ def test_soft_limits_are_noted(tmp_path: Path) -> None:
     soft = '<safety_controller k_velocity="20" soft_lower_limit="-1" soft_upper_limit="1"/>'
     [note] = read_urdf(written(tmp_path, chain("base", ["j"], more=soft))).notes
     assert note.startswith("joint j: the soft limits") and "lower -1, upper 1" in note
+    same = chain("base", ["j"], limits='lower="-1" upper="1"', more=soft)
+    assert not any("soft" in note for note in read_urdf(written(tmp_path, same)).notes), "they are the limits themselves"
 
 
 def test_a_mesh_without_volume_is_noted(tmp_path: Path) -> None:

@@ -370,11 +370,15 @@ class UrdfTree:
         joint = Joint(name, kind, *self.ends[name], self._origin(element, location), axis)
         if kind == "fixed":
             return joint
-        joint = self._with_limits(replace(joint, mimic=self._mimic(name, element)), element.find("limit"))
+        limit = element.find("limit")
+        joint = self._with_limits(replace(joint, mimic=self._mimic(name, element)), limit)
         safety = element.find("safety_controller")
         soft = {} if safety is None else safety.attrib
+        hard = {} if limit is None else limit.attrib
         soft_limits = [
-            f"{end} {soft[f'soft_{end}_limit']}" for end in ("lower", "upper") if f"soft_{end}_limit" in soft
+            f"{end} {soft[f'soft_{end}_limit']}"
+            for end in ("lower", "upper")
+            if soft.get(f"soft_{end}_limit") not in (None, hard.get(end))
         ]
         if soft_limits:
             self.notes.append(
@@ -563,7 +567,8 @@ class UrdfTree:
         except ValueError:
             values = np.zeros(0)
         if len(values) != count or not np.isfinite(values).all():
-            raise InputError(f"{self.path}: {what} is {shown(text)}; it must be {count} finite number(s)")
+            expected = "a finite number" if count == 1 else f"{count} finite numbers"
+            raise InputError(f"{self.path}: {what} is {shown(text)}; it must be {expected}")
         if not within(values, most):
             raise InputError(f"{self.path}: {what} is {shown(text)}; it must be within ±{most:g}")
         return values
