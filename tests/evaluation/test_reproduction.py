@@ -54,7 +54,9 @@ def test_workers_and_a_cluster_are_refused_together(tmp_path: Path, said: Said) 
     assert not (tmp_path / "out").exists()
 
 
-def test_the_command_of_table_2_names_the_family() -> None:
+def test_the_commands_of_pages_name_data_weights_and_family(tmp_path: Path) -> None:
+    of_figures = paper.Table1Settings(tmp_path, problems=3, paper_weights="paper", data="rop").command("figures")
+    assert of_figures.endswith(" figures --out FOLDER --problems 3 --time-limit 10 --paper-weights FOLDER --data DATA")
     settings = ablation.AblationSettings(data="rop", out="out", family="shelf", problems=1)
     half = ablation.Evaluation(*(np.full(1, 0.5) for _ in range(5)))
     page = ablation.table2(settings, [ablation.RowResult("Ours", half, half, (0.5,))])

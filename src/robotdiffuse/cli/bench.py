@@ -151,9 +151,7 @@ def run_figures(arguments: Namespace) -> int:
     settings, bench = _table1(arguments)
     out = settings.out
     count = min(settings.problems, FIGURE_PROBLEMS)
-    command = f"robotdiffuse reproduce figures --out FOLDER --problems {settings.problems} "
-    command += f"--time-limit {settings.time_limit:g}{' --cpu-time' * settings.cpu_time}"
-    report = paper.paper_report("Figures", command)
+    report = paper.paper_report("Figures", settings.command("figures"))
     report.add("## Figure 1")
     problem = hard_cases("rop", 1, out / "problems")[0].problem
     for number, state in enumerate(paper.denoising(problem)):
@@ -172,7 +170,9 @@ def run_figures(arguments: Namespace) -> int:
     caption = "a: success over time; goals are poses; problems that the straight line does not solve"
     report.plot("figure3a.svg", caption, paper.plot_success_over_time(bench))
     compared = paper.compared_motions(bench)
-    if compared is not None:
+    if compared is None:
+        report.add(f"b: missing, since no problem is solved by both {' and '.join(paper.COMPARED)}")
+    else:
         robot, scene = compared.case.problem.robot_and_scene_in_world()
         size = PictureSettings(shell=0.05)
         title = compared.case.name

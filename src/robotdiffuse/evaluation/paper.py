@@ -296,6 +296,15 @@ class Table1Settings:
         unguided = Row(f"{title}, no guidance", ":".join([diffusion, *ONE_SAMPLE]))
         return (*ROWS[:5], guided, unguided, *ROWS[5:], *controls)
 
+    def command(self, name: str) -> str:
+        """The command with these settings: `reproduce` with this name."""
+        weights = "" if self.paper_weights is None else " --paper-weights FOLDER"
+        weights += "" if self.data is None else " --data DATA"
+        return (
+            f"robotdiffuse reproduce {name} --out FOLDER --problems {self.problems} "
+            f"--time-limit {self.time_limit:g}{' --cpu-time' * self.cpu_time}{weights}"
+        )
+
     @property
     def bench(self) -> BenchSettings:
         return BenchSettings(
@@ -361,13 +370,7 @@ def _check_paper_weights(folder: str, time_limit: float) -> None:
 
 def table1(settings: Table1Settings, bench: Bench) -> Report:
     """The report of Table 1, with one table for each kind of goal, on non-trivial problems."""
-    weights = "" if settings.paper_weights is None else " --paper-weights FOLDER"
-    weights += "" if settings.data is None else " --data DATA"
-    command = (
-        f"robotdiffuse reproduce table1 --out FOLDER --problems {settings.problems} "
-        f"--time-limit {settings.time_limit:g}{' --cpu-time' * settings.cpu_time}{weights}"
-    )
-    report = paper_report("Table 1", command)
+    report = paper_report("Table 1", settings.command("table1"))
     rows = dict(zip(settings.bench.specs, settings.rows, strict=True))
     # the folder may contain more problems than are required
     names = {
