@@ -9,7 +9,7 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.commands import Said, run
-from helpers.panda import GOAL, PANDA, START
+from helpers.panda import GOAL, HOME, PANDA, START
 from helpers.stores import line, random_motions, record, write_motions
 
 BALL = rd.Scene([rd.Sphere([0.5, 0.0, 0.5], 0.15)])
@@ -22,15 +22,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "set"
 
 
-def test_info_prints_figures_and_writes_the_page(folder, said: Said):
+def test_info_prints_figures_and_writes_the_page_and_check_finds_no_fault(folder, said: Said):
     printed = said(0, "data", "info", folder)
     figures = "71.4 %", "tried: 9", "rop_dense", "length [rad]", "clearance [cm]"
     for text in ("panda: 5 motions", "waypoints, evenly spaced in length", *figures):
         assert text in printed, text
     assert (folder / "report.html").read_text().startswith("<!doctype html>")
-
-
-def test_check_of_clean_data(folder, said: Said):
     printed = said(0, "data", "check", folder, "--workers", 1, "--no-pybullet", "--count", 4)
     assert "panda: clean" in printed and re.search("validated .* 4 in", printed) and "not checked" in printed
 
@@ -71,7 +68,7 @@ def test_export(folder, said: Said):
 
 
 def test_info_on_motions_that_are_all_straight_warns_of_nothing(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
-    line = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]) + np.linspace(0, 0.3, 5)[:, None]
+    line = HOME + np.linspace(0, 0.3, 5)[:, None]
     rd.write_dataset([line] * 20, [rd.Scene([rd.Sphere([-2, 0.1 * i, 1], 0.1)]) for i in range(20)], tmp_path / "d")
     assert run("data", "info", tmp_path / "d", "--page", tmp_path / "page.html") == 0
     assert (tmp_path / "page.html").is_file() and not (tmp_path / "d" / "report.html").exists()

@@ -77,7 +77,6 @@ def test_degenerate_point_clouds(points: np.ndarray) -> None:
 
 
 def test_a_link_deep_in_a_point_cloud_and_an_empty_cloud() -> None:
-    """The depth is that of the deepest point, the middle of the box, which is nearer to the side than to the top."""
     points = np.stack([np.full(21, 0.25), np.linspace(-0.02, 0.02, 21), np.zeros(21)], axis=1)
     exact = ExactCollision(box_arm(), rd.Scene([rd.PointCloud(points, 0.01)]))
     assert exact.link_distances(Q0)[0].distance == pytest.approx(-HALF_WIDTH - 0.01, abs=1e-5)

@@ -40,8 +40,7 @@ def obstacle(k: int, rng: np.random.Generator) -> rd.MovingObstacle:
 
 
 def as_coal_sees(moves: rd.MovingObstacle, times: np.ndarray, q: np.ndarray) -> tuple[float | None, float]:
-    """The first time at which arm and obstacle touch by Coal, and the smallest distance before. Times at which they cannot
-    have come nearer than MOVED are left out."""
+    """The first time at which arm and obstacle touch by Coal, and the smallest distance before."""
     moments = np.arange(0.0, times[-1], STEP)
     k = 0
     least = np.inf
@@ -52,7 +51,7 @@ def as_coal_sees(moves: rd.MovingObstacle, times: np.ndarray, q: np.ndarray) -> 
         least = min(least, near)
         if near <= 0:
             return now, least
-        k += max(1, int(near / MOVED) - 1)
+        k += max(1, int(near / MOVED) - 1)  # until then they cannot have touched
     return None, least
 
 
@@ -165,7 +164,8 @@ def test_files_name_the_field() -> None:
 
 def test_moving_obstacles_stand_beside_neither_blends_nor_start_velocities() -> None:
     ball = rd.MovingObstacle(BALL, velocity=[0, 1, 0])
-    with pytest.raises(rd.InputError, match="moving cannot be combined with blend: among moving obstacles, motions stop"):
-        rd.Problem(PANDA, rd.Scene(), START, END, waypoints=[END], moving=[ball], blend=0.1)
-    with pytest.raises(rd.InputError, match="start_velocity cannot be combined with moving"):
-        rd.Problem(PANDA, rd.Scene(), START, END, moving=[ball], start_velocity=[0.1] * 7)
+    for more, message in (
+        ({"waypoints": [END], "blend": 0.1}, "moving cannot be combined with blend: among moving obstacles, motions stop"),
+        ({"start_velocity": [0.1] * 7}, "start_velocity cannot be combined with moving"),
+    ):
+        refuses(message, rd.Problem, PANDA, rd.Scene(), START, END, moving=[ball], **more)

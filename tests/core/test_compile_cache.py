@@ -70,7 +70,6 @@ FILES = {
     "called": """
 from arm.sizes import SIZE
 from robotdiffuse.core.kernels import kernel
-
 @kernel()
 def second(pair):
     return pair.a * SIZE
@@ -78,18 +77,11 @@ def second(pair):
     "kernel": """
 from arm.called import second
 from robotdiffuse.core.kernels import kernel
-
 @kernel()
 def first(pair):
     return second(pair)
 """,
-    "pairs": """
-from typing import NamedTuple
-
-class Pair(NamedTuple):
-    a: int
-    b: int
-""",
+    "pairs": "from typing import NamedTuple\nclass Pair(NamedTuple):\n    a: int\n    b: int\n",
 }
 CALL = """
 import re

@@ -157,9 +157,7 @@ def test_steps_are_begun_while_there_is_time_and_long_ones_if_it_is_enough() -> 
     with deadline(lambda: -1e-3), pytest.raises(OutOfTimeError, match=r"^a short step$"):
         check_time("a short step")
     check_time("anything", 1e9)
-
-
-def test_timing_is_begun_a_little_late_too() -> None:
+    # timing is begun a little late too
     with deadline(lambda: -0.5 * LONG):
         check_timing("a step")
         with pytest.raises(OutOfTimeError, match=r"rows, which takes about 0\.3 s"):

@@ -65,16 +65,12 @@ def test_values_out_of_bounds_or_of_another_type_are_refused() -> None:
     refuses("^search.order is 1; it takes first, best", Search, order=1)
     refuses("^search.inner is 3; it takes Coarse", Search, inner=3)
     refuses(r"^search.levels\[0\] is 'a'; it takes a number above 0", Search, levels=["a"])
-    assert Search(step=np.float32(0.5), range=2).step == 0.5  # type: ignore[arg-type]
 
 
-def test_json_and_back() -> None:
+def test_json_and_back_and_json_that_is_wrong() -> None:
     settings = Search(step=2.0, range=0.5, levels=(1.0,), grid="fine", grid_settings=Fine(0.3), inner=Coarse(7))
     assert Search.from_json(settings.to_json(), "file") == settings
     assert Search.from_json({"step": 2}, "file") == Search(step=2.0)
-
-
-def test_json_that_is_wrong() -> None:
     for values, message in (
         ({"stp": 1}, "file.stp is not a setting; known: step, clearance"),
         ({"step": "far"}, "file.step is 'far'; it takes a number above 0"),
@@ -85,24 +81,19 @@ def test_json_that_is_wrong() -> None:
         ([], "must be a table of settings"),
     ):
         refuses(re.escape(message), Search.from_json, values, "file")
+    # Regression: weights whose description lacked a number raised IndexError; found by fuzzing.
+    refuses(r"region.center is \[0.0, 0.1\]; it must have 3 entries", VisibleRegion.from_json, {"center": [0.0, 0.1]}, "region")
 
 
-def test_assignments() -> None:
+def test_assignments_and_those_that_are_wrong() -> None:
     changed = Search().changed(["step=1e-3", "inner.cells=5", "greedy=true", "range=none", "order=best"])
     assert changed == Search(step=0.001, inner=Coarse(5), greedy=True, range=None, order="best")
     assert Search().changed(["levels=[1, 2]"]).levels == (1.0, 2.0)
 
-
-def test_assignments_that_are_wrong() -> None:
     refuses("search has no setting 'reach'; it has step=1.0, .*range=none, .*inner.cells=3", Search().changed, ["reach=1"])
     refuses("'step' is not NAME=VALUE", Search().changed, ["step"])
     refuses("search.step is 'big'; it takes a number above 0", Search().changed, ["step=big"])
     refuses("search.greedy is 1; it takes true or false", Search().changed, ["greedy=1"])
-
-
-def test_tuples_of_a_fixed_length_have_it() -> None:
-    """Regression: weights whose description lacked a number raised IndexError; found by fuzzing."""
-    refuses(r"region.center is \[0.0, 0.1\]; it must have 3 entries", VisibleRegion.from_json, {"center": [0.0, 0.1]}, "region")
 
 
 def test_descriptions() -> None:
@@ -124,19 +115,14 @@ def test_registry() -> None:
 
 
 def test_numbers_of_numpy_and_lists_are_kept_as_python_has_them() -> None:
-    found = Search(step=np.float32(0.5), levels=[np.float64(0.5)], inner=Coarse(np.int64(2)))  # type: ignore
-    assert found == Search(step=0.5, levels=(0.5,), inner=Coarse(2))
+    found = Search(step=np.float32(0.5), range=2, levels=[np.float64(0.5)], inner=Coarse(np.int64(2)))  # type: ignore
+    assert found == Search(step=0.5, range=2.0, levels=(0.5,), inner=Coarse(2))
     assert [type(x) for x in (found.step, found.levels, found.inner.cells)] == [float, tuple, int]
 
 
-FAMILY = """from robotdiffuse.problems.families.rop import Rop
-ONE = Rop(obstacles=(1, 1))
-"""
-
-
 def test_worker_processes_have_the_entries_that_the_package_lacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A family in a separate module, added at run time."""
-    (tmp_path / "one_obstacle.py").write_text(FAMILY)
+    family = "from robotdiffuse.problems.families.rop import Rop\nONE = Rop(obstacles=(1, 1))\n"
+    (tmp_path / "one_obstacle.py").write_text(family)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setitem(FAMILIES, "one", Entry("one_obstacle:ONE", "for tests"))
     one = Rop(obstacles=(1, 1))

@@ -35,10 +35,6 @@ def pose_goal() -> rd.PoseGoal:
     return rd.PoseGoal("l3", POSE, HALF, HALF)
 
 
-def problem() -> rd.Problem:
-    return rd.Problem(box_arm(), rd.Scene([sphere()]), ROWS[0], ROWS, T_world_base=POSE, start_velocity=HALF)
-
-
 def robot() -> rd.Robot:
     spheres = {link: np.array(rows) for link, rows in box_arm().spheres.items()}
     joints = tuple(Joint(j.name, j.kind, j.parent, j.child, POSE, UP) for j in box_arm().joints)
@@ -77,7 +73,7 @@ VALUES: dict[type[Value], Callable[[], Value]] = {
     rd.OnPlane: lambda: rd.OnPlane("l3", HALF, UP, 0.1),
     rd.OnLine: lambda: rd.OnLine("l3", HALF, UP, 0.1),
     rd.CartesianLine: lambda: rd.CartesianLine("l3"),
-    rd.Problem: problem,
+    rd.Problem: lambda: rd.Problem(box_arm(), rd.Scene([sphere()]), ROWS[0], ROWS, T_world_base=POSE, start_velocity=HALF),
     rd.Path: lambda: rd.Path(("a", "b", "c"), ROWS),
     rd.Trajectory: lambda: rd.Trajectory(("a", "b", "c"), TIMES, ROWS, ROWS, ROWS),
 }

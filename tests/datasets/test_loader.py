@@ -15,18 +15,8 @@ from helpers.panda import PANDA
 from helpers.refusals import refuses
 from helpers.stores import manifest_of, random_arrays, write_store
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.datasets import shards
 from robotdiffuse.datasets.loader import RopBatch, RopDataset
-from robotdiffuse.datasets.shards import (
-    SPLITS,
-    read_shard,
-    resample,
-    shard_path,
-    split_of,
-    turned,
-    turns_about_vertical,
-    write_manifest,
-    write_shard,
-)
 from robotdiffuse.problems.families.rop import ROP_DENSE
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 
@@ -48,14 +38,14 @@ def joined(batches) -> RopBatch:
 
 
 def stored(store, name):
-    return np.concatenate([read_shard(store, i)[name] for i in range(len(SIZES))])
+    return np.concatenate([shards.read_shard(store, i)[name] for i in range(len(SIZES))])
 
 
 def test_every_row_of_a_split_once(store):
-    split = split_of(PackedScenes(stored(store, "obstacle_kinds"), stored(store, "obstacle_params")))
+    split = shards.split_of(PackedScenes(stored(store, "obstacle_kinds"), stored(store, "obstacle_params")))
     goals = stored(store, "goals")
     goals = goals[np.arange(len(goals)), stored(store, "goal_index")]
-    for i, name in enumerate(SPLITS):
+    for i, name in enumerate(shards.SPLITS):
         data = RopDataset(store, name, points=8)
         batch = joined(data.batches(32, shuffle=False))
         assert len(data) == (split == i).sum() == len(batch) > 0
@@ -126,11 +116,11 @@ def test_standard_loader_and_pickles(store, workers):
 
 def test_resampling():
     q = np.array([[[0.0, 0.0], [1.0, 0.0], [3.0, 0.0], [3.0, 1.0]], [[1.0, 2.0]] * 4], np.float32)
-    even = resample(q, 5)
+    even = shards.resample(q, 5)
     np.testing.assert_allclose(even[0], [[0, 0], [1, 0], [2, 0], [3, 0], [3, 1]], atol=1e-6)
     np.testing.assert_array_equal(even[1], q[1, [0] * 5])
-    assert resample(q[:0], 5).shape == (0, 5, 2)
-    assert (resample(q[1:], 3) == q[1, 0]).all()
+    assert shards.resample(q[:0], 5).shape == (0, 5, 2)
+    assert (shards.resample(q[1:], 3) == q[1, 0]).all()
 
 
 def test_bad_input(store, tmp_path):
@@ -141,16 +131,16 @@ def test_bad_input(store, tmp_path):
     refuses("batch_size is 0", RopDataset(store).batches, 0)
 
     def shard(waypoints):
-        write_shard(tmp_path, 0, random_arrays(ARM, 5, np.random.default_rng(0), waypoints), {})
+        shards.write_shard(tmp_path, 0, random_arrays(ARM, 5, np.random.default_rng(0), waypoints), {})
 
     def damaged():
         shard(WAYPOINTS)
-        chunks = (shard_path(tmp_path, 0) / "trajectories" / "c").rglob("*")
+        chunks = (shards.shard_path(tmp_path, 0) / "trajectories" / "c").rglob("*")
         next(p for p in chunks if p.is_file()).write_bytes(b"")
 
     for change, message in [
         (lambda: None, "no data set"),
-        (lambda: write_manifest(tmp_path, manifest_of(ARM, WAYPOINTS)), "holds no shard"),
+        (lambda: shards.write_manifest(tmp_path, manifest_of(ARM, WAYPOINTS)), "holds no shard"),
         (lambda: shard(WAYPOINTS + 1), r"shard_00000\.zarr, array trajectories has rows of shape"),
         (damaged, r"shard_00000\.zarr, array trajectories is damaged"),
     ]:
@@ -163,7 +153,7 @@ def test_turned_motions_have_the_same_clearances():
     packed = PackedScenes.pack([ROP_DENSE.scene(rng) for _ in range(6)], ROP_DENSE.max_obstacles, floor=True)
     start, goal = rng.uniform(PANDA.lower, PANDA.upper, (2, 6, PANDA.dof))
     q = np.linspace(start, goal, 20, axis=1).astype(np.float32)
-    q_turned, packed_turned, clear = turned(PANDA, q, packed, rng)
+    q_turned, packed_turned, clear = shards.turned(PANDA, q, packed, rng)
     np.testing.assert_array_equal(q_turned[..., 1:], q[..., 1:])
     assert (q_turned >= PANDA.lower.astype(np.float32)).all() and (q_turned <= PANDA.upper.astype(np.float32)).all()
     angle = q_turned[:, :, 0] - q[:, :, 0]
@@ -177,10 +167,10 @@ def test_turned_motions_have_the_same_clearances():
 
 def test_a_motion_that_uses_the_whole_range_of_the_first_joint_stays():
     q = np.linspace(PANDA.lower, PANDA.upper, 5)[None].astype(np.float32)
-    same, _, _ = turned(PANDA, q, PackedScenes.pack([rd.Scene([])], 1), np.random.default_rng(0))
+    same, _, _ = shards.turned(PANDA, q, PackedScenes.pack([rd.Scene([])], 1), np.random.default_rng(0))
     np.testing.assert_allclose(same, q, atol=1e-6)
 
 
 @pytest.mark.parametrize(("name", "vertical"), [("panda", True), ("ur5", True), ("awkward", False)])
 def test_which_robots_turn(name, vertical):
-    assert turns_about_vertical(example_robot(name)) is vertical
+    assert shards.turns_about_vertical(example_robot(name)) is vertical

@@ -17,7 +17,7 @@ from helpers.commands import python
 from helpers.factory_runs import contents
 from helpers.refusals import refuses
 from helpers.stores import manifest_of, random_arrays, write_store
-from robotdiffuse.core.errors import InputError, OutputError
+from robotdiffuse.core.errors import OutputError
 from robotdiffuse.datasets import shards
 from robotdiffuse.datasets.external import import_npz
 from robotdiffuse.robots import load_robot
@@ -67,8 +67,8 @@ def test_times_and_no_rows(tmp_path, arrays):
     shards.write_shard(tmp_path, 0, timed, {})
     shard = shards.check_shard(tmp_path, 0, manifest_of(ARM, WAYPOINTS, timing="time"))
     assert len(shard) == 0 and shard["trajectories"].shape == (0, WAYPOINTS, ARM.dof)
-    with pytest.raises(InputError, match="array times: it must exist if timing is time, and only then"):
-        shards.check_shard(tmp_path, 0, manifest_of(ARM, WAYPOINTS))
+    untimed = manifest_of(ARM, WAYPOINTS)
+    refuses("array times: it must exist if timing is time, and only then", shards.check_shard, tmp_path, 0, untimed)
 
 
 def test_same_arrays_same_bytes_or_none_where_arrays_do_not_fit(tmp_path, arrays):

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from helpers.box_arm import box_arm
+from helpers.changes import later
 from helpers.example_robots import planar_arm
 from helpers.refusals import refuses
 from helpers.small_model import cloud, save_small_model, small_model
@@ -46,24 +47,17 @@ def test_wrong_robot_is_refused(tmp_path):
         refuses(message, checkpoint.load_network, "model", tmp_path, robot)
 
 
-def weights(change):
-    def damage(folder):
-        file = folder / "model.safetensors"
-        data = file.read_bytes()
-        file.unlink()
-        if change is not None:
-            file.write_bytes(change(data))
-
-    return damage
+@later
+def weights(folder, change):
+    data = (folder / "model.safetensors").read_bytes()
+    (folder / "model.safetensors").write_bytes(change(data))
 
 
-def described(change):
-    def damage(folder):
-        values = json.loads((folder / "model.json").read_text())
-        change(values)
-        (folder / "model.json").write_text(json.dumps(values))
-
-    return damage
+@later
+def described(folder, change):
+    values = json.loads((folder / "model.json").read_text())
+    change(values)
+    (folder / "model.json").write_text(json.dumps(values))
 
 
 def setting(**values):
@@ -78,7 +72,7 @@ def setting(**values):
         (described(lambda about: about["robot"]["frame_offsets"][0][0].pop()), "not 4 x 4"),
         (weights(lambda data: data[:-100]), "model.safetensors"),
         (weights(lambda data: data[:-50] + bytes([data[-50] ^ 1]) + data[-49:]), "model.safetensors"),
-        (weights(None), "model.safetensors"),
+        (lambda folder: (folder / "model.safetensors").unlink(), "model.safetensors"),
         (lambda folder: (folder / "model.json").unlink(), "holds no model"),
         (lambda folder: (folder / "model.json").write_text('{"robot": '), "model.json"),
         (described(lambda about: about["settings"].update(wings=2)), "model.json"),

@@ -51,8 +51,8 @@ def test_training_begins_with_the_weights_that_it_is_given() -> None:
     task = training.CompletionTask(settings, training.Processes("cpu"))
     given = load_completion().state_dict()
     assert all(torch.equal(value, given[name]) for name, value in task.module.state_dict().items())
-    with pytest.raises(rd.InputError, match="weights bundled: their network has"):
-        training.CompletionTask(replace(TINY, weights="bundled"), training.Processes("cpu"))
+    other = replace(TINY, weights="bundled")
+    refuses("weights bundled: their network has", training.CompletionTask, other, training.Processes("cpu"))
     refuses(r"families.*rap.*crate", replace, TINY, families=("rap",))
 
 

@@ -1,7 +1,6 @@
 """Networks as ONNX Runtime runs them, against PyTorch."""
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-import robotdiffuse as rd
 from helpers.box_arm import box_arm
+from helpers.panda import PANDA
 from helpers.refusals import refuses
 from helpers.small_model import save_small_model, small_model
 from robotdiffuse.learning.checkpoint import fingerprint, load_completion, load_network, save_network
@@ -22,7 +21,6 @@ from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.weight_files import BUNDLED
 from robotdiffuse.perception.voxel_grid import SHAPE
 
-PANDA = rd.load_robot("panda")
 RELATIVE_TOLERANCE = 1e-5
 """As a fraction of the largest number: fp32 rounds to 6e-8, and a network has some hundred roundings in a row."""
 MAX_FILE_SIZE = 16e6
@@ -83,16 +81,9 @@ def test_a_cloud_in_order_is_that_of_the_compression_autoencoder() -> None:
         np.testing.assert_allclose(encoder.settings.prepared(cloud), ours, atol=1e-6)
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    place = tmp_path_factory.mktemp("weights")
-    save_small_model(place)
-    return place
-
-
-def test_weights_that_are_trained_anew_are_read(folder: Path, tmp_path: Path, no_export: None) -> None:
-    for file in folder.iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
+def test_weights_that_are_trained_anew_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_small_model(tmp_path)
+    monkeypatch.setattr(MotionNetwork, "exports", lambda _: {})  # it takes seconds
     first = exported_model("model", tmp_path, box_arm())
     assert exported_model("model", tmp_path, box_arm()) is first
     _described(tmp_path, "settings", {"sampling_steps": 3})
@@ -119,7 +110,7 @@ def _described(folder: Path, field: str, change: dict) -> None:
         (lambda at: _described(at, "settings", {"waypoints": 20}), r"model\.json does not fit its ONNX"),
     ],
 )
-def test_damaged_files_give_one_line(folder: Path, tmp_path: Path, damage: Any, message: str) -> None:
-    copied = shutil.copytree(folder, tmp_path / "weights")
-    damage(copied)
-    refuses(message, exported_model, "model", copied, box_arm())
+def test_damaged_files_give_one_line(tmp_path: Path, damage: Any, message: str) -> None:
+    save_small_model(tmp_path)
+    damage(tmp_path)
+    refuses(message, exported_model, "model", tmp_path, box_arm())

@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import robotdiffuse as rd
+from helpers.panda import PANDA
+from helpers.refusals import refuses
 from helpers.sphere_oracles import distance, random_shape
 from robotdiffuse.perception.ray_caster import MAX_RANGE, looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.voxel_grid import VoxelGrid
 
-PANDA = rd.load_robot("panda")
 SIZE = (64, 48)
 INTRINSICS = (60.0, 60.0, 31.5, 23.5)
 
@@ -119,5 +120,5 @@ def test_voxels_that_hold_obstacles(seed: int) -> None:
 
 
 def test_what_rays_do_not_know_is_refused() -> None:
-    with pytest.raises(rd.InputError, match="point_cloud is a point_cloud; only spheres, boxes"):
-        ray_cast(rd.Scene([rd.PointCloud(np.zeros((1, 3)))]), np.eye(4), INTRINSICS, SIZE)
+    cloud = rd.Scene([rd.PointCloud(np.zeros((1, 3)))])
+    refuses("point_cloud is a point_cloud; only spheres, boxes", ray_cast, cloud, np.eye(4), INTRINSICS, SIZE)

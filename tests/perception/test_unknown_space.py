@@ -7,17 +7,9 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.collision.kernel_arrays import compile_robot
+from robotdiffuse.perception import unknown_space
 from robotdiffuse.perception.observed_volume import ObservedVolume
-from robotdiffuse.perception.unknown_space import (
-    EXPLORED,
-    ONE_VIEW,
-    RATES,
-    CrossedSpace,
-    UnknownSpace,
-    confidence,
-    lost_regions,
-    probability_free,
-)
+from robotdiffuse.perception.unknown_space import EXPLORED, ONE_VIEW, CrossedSpace, UnknownSpace, probability_free
 from robotdiffuse.perception.voxel_grid import FINE, FINE_SHAPE, LOW, SHAPE, VOXEL, heaviest_part, surface, sweep
 
 PANDA = rd.load_robot("panda")
@@ -36,20 +28,20 @@ def test_the_probability_that_a_motion_is_free_falls_with_its_risk(curve: tuple[
 
 def test_confidence_follows_from_the_risk_or_is_the_rate_of_the_assumption() -> None:
     likely = np.full(FINE_SHAPE, 0.01, np.float32)
-    stated = confidence("predicted, p > 0.1", CrossedSpace(VOXELS, likely))
+    stated = unknown_space.confidence("predicted, p > 0.1", CrossedSpace(VOXELS, likely))
     assert np.isclose(stated, probability_free(0.01 * VOXELS.sum(), ONE_VIEW), rtol=1e-4)
-    assert confidence("predicted, p > 0.1", CrossedSpace(VOXELS, likely, lost_share=0.5)) == stated / 2
-    assert all(confidence(name, CrossedSpace(VOXELS, None)) == rate for name, rate in RATES.items())
+    assert unknown_space.confidence("predicted, p > 0.1", CrossedSpace(VOXELS, likely, lost_share=0.5)) == stated / 2
+    assert all(unknown_space.confidence(name, CrossedSpace(VOXELS, None)) == rate for name, rate in unknown_space.RATES.items())
 
 
 def test_only_wide_regions_without_a_return_lower_the_confidence() -> None:
     lost = np.zeros(SHAPE, np.bool_)
     volume = ObservedVolume(lost, lost, lost, lost, np.zeros(SHAPE, np.float32), lost)
-    assert not lost_regions(volume).any()
+    assert not unknown_space.lost_regions(volume).any()
     lost[10:12, 10:30, 10:30] = True
-    assert not lost_regions(volume).any()
+    assert not unknown_space.lost_regions(volume).any()
     lost[30:34, 20:23, 4:9] = True
-    assert lost_regions(volume).sum() == 8 * 4 * 3 * 5
+    assert unknown_space.lost_regions(volume).sum() == 8 * 4 * 3 * 5
 
 
 def test_only_what_the_arm_fills_at_the_ends_is_left_out_without_a_margin() -> None:

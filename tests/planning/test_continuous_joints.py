@@ -78,15 +78,12 @@ def test_images_of_a_goal() -> None:
     assert (np.abs([nearest, first, last]) <= CONTINUOUS_LIMIT).all()
 
 
-def test_limits_of_a_continuous_joint() -> None:
-    """Limits make a continuous joint revolute: the validator checks none of continuous ones, and files keep the kind."""
+def test_limits_of_a_continuous_joint(tmp_path: FilePath) -> None:
+    """Limits make it revolute, as the validator checks none of continuous ones; in robot folders it has those of planning."""
     assert rd.Problem(ARM, rd.Scene(), [50.0, 0.0, 0.0], [0.0, 0.0, 0.0]).start[0] == 50.0
     narrow = with_limits(ARM, {"j0": {"lower": -1.0}})
     assert (narrow.planned_joints[0].kind, narrow.lower[0], narrow.upper[0]) == ("revolute", -1.0, np.pi)
     refuses("j0 is 50 rad; its limits are -1", rd.Problem, narrow, rd.Scene(), [50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
-
-
-def test_continuous_joints_of_robot_folders_have_the_planning_limits(tmp_path: FilePath) -> None:
     joints = tuple(replace(j, lower=-np.pi, upper=np.pi) if j.name == "j0" else j for j in ARM.joints)
     write_robot_folder(replace(ARM, joints=joints), tmp_path, {})
     robot = read_robot_folder(tmp_path)

@@ -60,14 +60,11 @@ def test_the_loop_ends_and_strict_motions_do_not_collide(policy: str) -> None:
     assert all(value is None or value >= 0.98 for value in stated)
 
 
-@pytest.mark.parametrize(
-    ("factor", "message"),
-    [(1000.0, "its depths are about .*; they must be in meters"), (2.0, "sees through 100 % of where the arm")],
-)
-def test_an_image_that_sees_through_the_arm_is_refused(factor: float, message: str) -> None:
+def test_an_image_that_sees_through_the_arm_is_refused() -> None:
     arm = explorer(seen=False)
-    refuses(f"check the camera of the view: .*{message}", arm.observe, replace(view(), depth=factor * view().depth))
-    assert arm.map.is_blind
+    for factor, message in ((1000.0, "its depths are about .*; they must be in meters"), (2.0, "sees through 100 % of where")):
+        refuses(f"check the camera of the view: .*{message}", arm.observe, replace(view(), depth=factor * view().depth))
+        assert arm.map.is_blind
 
 
 def test_a_view_of_another_thread_waits_for_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -254,8 +251,8 @@ ABOVE_AND_BESIDE = ((1.3, -0.5, 0.6), (-0.3, 1.1, 0.9), (0.4, 1.3, 0.2))
 
 def test_a_goal_behind_a_plate_is_refused_until_views_show_it() -> None:
     """Without `see_goal`, `strict` accepts the goal unseen: the motion is within 2 cm of the arm at start or goal."""
-    with pytest.raises(rd.InputError, match=r"explorer.see_goal is true and explorer.policy 'probabilistic'"):
-        rd.ExplorerSettings(policy="probabilistic", see_goal=True)
+    message = "explorer.see_goal is true and explorer.policy 'probabilistic'"
+    refuses(message, rd.ExplorerSettings, policy="probabilistic", see_goal=True)
     plate = rd.Box((1.0, 0.7, 0.6), (0.02, 0.8, 1.2), wxyz=(0.94, 0, 0, 0.34))
     goal = LEFT.copy()
     goal[0] += 0.12
@@ -292,32 +289,25 @@ def test_a_thing_at_the_surface_of_a_goal_is_seen_as_free_by_no_view() -> None:
     assert balls[-1].tolist() not in unseen[0][-1].tolist()
 
 
-@pytest.mark.parametrize("name", ["waypoints", "moving"])
-def test_fields_that_exploring_would_ignore_are_refused(name: str) -> None:
+def test_fields_that_exploring_would_ignore_are_refused() -> None:
     ball = rd.MovingObstacle(rd.Sphere([0.9, 0.0, 0.9], 0.05, name="ball"), velocity=[0.1, 0, 0])
-    fields = {"waypoints": [PROBLEM.start], "moving": [ball]}
-    with pytest.raises(rd.InputError, match=f"the problem has {name}, which explore does not support"):
-        simulated.simulated_explorer(replace(PROBLEM, **{name: fields[name]}), rd.ExplorerSettings(), None, 0)
+    for name, field in (("waypoints", [PROBLEM.start]), ("moving", [ball])):
+        asked = replace(PROBLEM, **{name: field})
+        message = f"the problem has {name}, which explore does not support"
+        refuses(message, simulated.simulated_explorer, asked, rd.ExplorerSettings(), None, 0)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
+def test_an_explorer_and_a_camera_of_wrong_parts_are_refused() -> None:
+    make = unwrap(rd.Explorer.__init__)  # past the type checks of the tests, which users do not have
+    for wrong, message in (
         ({"robot": "panda"}, "robot is 'panda'; it must be a Robot"),
         ({"cameras": ["wrist"]}, r"cameras\[0\] is 'wrist'; it must be an ArmCamera"),
         ({"scene": []}, r"scene is \[\]; it must be a Scene"),
         ({"seed": -1}, "seed is -1; it must be at least 0"),
-    ],
-)
-def test_an_explorer_of_wrong_parts_is_refused(wrong: dict[str, object], message: str) -> None:
-    # past the type checks of the tests, which users do not have
-    make = unwrap(rd.Explorer.__init__)
-    refuses(message, make, object.__new__(rd.Explorer), **{"robot": rd.load_robot("panda"), **wrong})
-
-
-@pytest.mark.parametrize("far", [0.0, np.nan, np.inf])
-def test_the_range_of_a_camera_is_a_positive_number(far: float) -> None:
-    refuses("camera.range is .* it must be a number", rd.ArmCamera, "panda_hand", np.eye(4), (1.0,) * 4, (2, 2), far)
+    ):
+        refuses(message, make, object.__new__(rd.Explorer), **{"robot": PANDA, **wrong})
+    for far in (0.0, np.nan, np.inf):
+        refuses(f"camera.range is {far}; it must be a number", rd.ArmCamera, "panda_hand", np.eye(4), (1.0,) * 4, (2, 2), far)
 
 
 def test_steps_and_views_are_kept_with_their_times() -> None:

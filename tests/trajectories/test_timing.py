@@ -454,10 +454,8 @@ def test_the_time_of_a_line_by_hand():
     assert np.isclose(straight_line_time(START, FAR, np.array([6.0, 0.5]), np.array([3.0, 1.0])), 2.0 + 0.5)
     # the greatest jerk alone binds in short motions
     assert np.isclose(straight_line_time(START, NEAR, one, one, one), 4 * np.cbrt(0.05))
-
-
-def test_no_jerk_limit_is_the_limit_of_great_jerk():
-    one = np.ones(2)
+    refuses("acceleration", straight_line_time, START, FAR, one, np.zeros(2))
+    # no jerk limit is the limit of great jerk
     for goal in (FAR, NEAR):
         plain = straight_line_time(START, goal, one, one)
         for jerk in (np.full(2, 1e9), np.full(2, np.inf), np.zeros(2)):
@@ -494,7 +492,3 @@ def test_along_a_line_as_toppra_times_it():
         by_toppra = toppra.algorithm.TOPPRA(limits, path, grid, parametrizer="ParametrizeConstAccel")
         trajectory: Any = by_toppra.compute_trajectory(0, 0)
         assert straight_line_time(START, goal, v, a) == pytest.approx(trajectory.duration, rel=5e-3)
-
-
-def test_limits_of_a_line_that_are_not_positive_are_refused():
-    refuses("acceleration", straight_line_time, START, FAR, np.ones(2), np.zeros(2))

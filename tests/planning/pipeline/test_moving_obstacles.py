@@ -110,8 +110,7 @@ def test_a_stop_at_a_waypoint_is_not_gone_through() -> None:
 
 def test_corners_are_rounded_as_far_as_the_planner_certified() -> None:
     """Without rounding, the motion stops at the corner; with little, it passes more slowly than by default."""
-    middle = np.array([0.0, 0.9, 0, -1.8, 0, 2.1, 0.8])
-    path = rd.Path(PANDA.joint_names, np.stack([START, middle, GOAL]))
+    path = rd.Path(PANDA.joint_names, np.stack([START, [0.0, 0.9, 0, -1.8, 0, 2.1, 0.8], GOAL]))
     shortest = []
     for deviations in (None, np.zeros(3), np.full(3, 0.02)):
         timing = time_parameterize(PANDA, path, lambda _: True, lambda _: True, deviations=deviations)

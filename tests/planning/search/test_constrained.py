@@ -49,8 +49,7 @@ def test_motions_keep_constraints_at_every_millimeter(name, stage, constraints, 
     monkeypatch.setattr(rrt.RRTConnect, "follows_lines", False)
     made = problem(constraints, scene)
     result = rd.load_planner(name).plan(made, time_limit=20.0)
-    assert result.solved, result.reason
-    assert result.stage == stage
+    assert result.solved and result.stage == stage, result.reason
     assert rd.verify(made, result.path).valid and rd.verify(made, result.trajectory).valid
     for rows in (result.path.positions, result.trajectory.positions):
         for a, b in pairwise(rows):
