@@ -49,16 +49,12 @@ def test_huge_shapes_are_never_called_valid(kind: type[Shape], distance: float) 
     turn = [np.sqrt(0.5), 0, np.sqrt(0.5), 0]  # z along x
     for depth, valid in ((0.002, False), (-0.02, True)):
         half = distance - 1.2 + depth  # the arm ends at x = 1.2 m
-        center = [distance, 0, 0]
-        shape = {
-            rd.Sphere: lambda half=half, center=center: rd.Sphere(center, half),
-            rd.Box: lambda half=half, center=center: rd.Box(center, 2 * np.array([half, half, half])),
-            rd.Cylinder: lambda half=half, center=center: rd.Cylinder(center, half, 2 * half, turn),
-            rd.Capsule: lambda half=half, center=center: rd.Capsule(center, half / 2, half, turn),
-        }[kind]
-        if max(2 * half, distance) > 1e4 and kind in (rd.Box, rd.Cylinder):
+        side = 2 * half
+        if max(side, distance) > 1e4 and kind in (rd.Box, rd.Cylinder):
             return
-        validated = rd.verify(replace(problem, scene=rd.Scene([shape()])), rd.Path(robot.joint_names, rows))
+        sizes = {rd.Sphere: (half,), rd.Box: ([side] * 3,), rd.Cylinder: (half, side, turn), rd.Capsule: (half / 2, half, turn)}
+        shape = kind([distance, 0, 0], *sizes[kind])  # type: ignore
+        validated = rd.verify(replace(problem, scene=rd.Scene([shape])), rd.Path(robot.joint_names, rows))
         assert validated.valid == valid, (depth, validated)
 
 
@@ -79,7 +75,7 @@ def test_poses_with_rounding_errors_are_accepted() -> None:
     refuses(r"a pose is .* homogeneous transform", rigid_transform, "a pose", T)
 
 
-def test_a_pose_by_quaternion_and_by_rpy_is_scipys() -> None:
+def test_a_pose_by_quaternion_and_by_rpy_is_scipys_and_wrong_ones_are_refused() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         xyz, rpy = rng.normal(size=(2, 3))
@@ -89,9 +85,6 @@ def test_a_pose_by_quaternion_and_by_rpy_is_scipys() -> None:
             np.testing.assert_array_equal(T[:3, 3], xyz)
             np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
     np.testing.assert_array_equal(rd.pose([1, 2, 3])[:3, :3], np.eye(3))
-
-
-def test_wrong_poses_are_refused() -> None:
     refuses("pose has wxyz and rpy; give one of them", rd.pose, [0, 0, 0], wxyz=[1, 0, 0, 0], rpy=[0, 0, 0])
     refuses(r"pose.rpy \[rad\] is \[0, 0\]; it must be 3 finite numbers", rd.pose, [0, 0, 0], rpy=[0, 0])
     refuses("a quaternion must not be zero", rd.pose, [0, 0, 0], wxyz=[0, 0, 0, 0])

@@ -18,10 +18,12 @@ from robotdiffuse.perception.depth_view_files import read_depth, read_views, vie
 from robotdiffuse.scenes.surface_points import sample_surface
 
 K = (50.0, 50.0, 31.5, 23.5)
+MATRIX = [[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]]
+CAMERA = {"xyz": [0, 0, 0], "wxyz": [1, 0, 0, 0]}
 T = transform(np.array([1.5, 0.2, 0.8]), rotation_about(np.array([0.6, 0.0, 0.8]), 1.1))
 
 
-def test_points_of_pixels() -> None:
+def test_points_of_pixels_and_intrinsics_as_a_mapping_or_a_matrix() -> None:
     depth = np.zeros((48, 64))
     depth[10, 20] = 2.0
     depth[0, 0] = np.nan
@@ -30,6 +32,9 @@ def test_points_of_pixels() -> None:
     view = rd.DepthView(depth, K, T)
     by_hand = T @ [(20 - 31.5) / 50 * 2, (10 - 23.5) / 50 * 2, 2.0, 1.0]
     assert np.allclose(view.points(), by_hand[:3])
+    each: list[Any] = [dict(zip(("fx", "fy", "cx", "cy"), K, strict=True)), MATRIX, np.array(MATRIX)]
+    for given in each:
+        assert rd.DepthView(depth, given, T).intrinsics == K
 
 
 def test_a_cloud_becomes_the_image_that_its_camera_had() -> None:
@@ -45,6 +50,8 @@ def test_a_cloud_becomes_the_image_that_its_camera_had() -> None:
     for half, z in ((upper, 1.0), (lower, 2.0)):
         assert np.mean(half > 0) > 0.6 and np.allclose(half[half > 0], z, atol=1e-5)
     refuses("none of 10 is in front", rd.DepthView.from_cloud, T[:3, 3] - T[:3, 2] + np.zeros((10, 3)), T)
+    for wrong in (np.zeros((3, 2)), np.ones((2, 3)) + 1j, [[0, 0, np.nan]], "abc", []):
+        refuses("view.points", rd.DepthView.from_cloud, wrong, T)
 
 
 def test_what_is_refused() -> None:
@@ -86,9 +93,7 @@ def test_depth_files(tmp_path: Path) -> None:
         "a.jpg": "unknown depth image format",
     }.items():
         refuses(message, read_depth, tmp_path / name)
-
-
-def test_integers_of_65535_are_no_returns(tmp_path: Path) -> None:
+    # integers of 65535 are no returns
     Image.fromarray(np.array([[1000, 65535]], np.uint16)).save(tmp_path / "a.png")
     np.save(tmp_path / "a.npy", np.array([[1000, 65535]], np.uint16))
     for name in ("a.png", "a.npy"):
@@ -99,11 +104,6 @@ def test_integers_of_65535_are_no_returns(tmp_path: Path) -> None:
 def test_depths_that_files_write_for_infinity_are_infinite() -> None:
     view = rd.DepthView([[1.0, np.inf]], K, T)
     assert rd.DepthView(view_entry(view, None)["depth"], K, T).depth.tolist() == [[1.0, np.inf]]
-
-
-@pytest.mark.parametrize("points", [np.zeros((3, 2)), np.ones((2, 3)) + 1j, [[0, 0, np.nan]], "abc", []])
-def test_a_wrong_cloud_makes_no_view(points: object) -> None:
-    refuses("view.points", rd.DepthView.from_cloud, points, T)
 
 
 def test_openexr_depth(tmp_path: Path) -> None:
@@ -138,9 +138,6 @@ def test_views_survive_their_files(tmp_path: Path) -> None:
         assert np.allclose(view.T_base_camera, T)
 
 
-MATRIX = [[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]]
-
-
 @pytest.mark.parametrize(
     ("name", "content"),
     [
@@ -158,19 +155,19 @@ def test_intrinsics_beside_an_image(name: str, content: Any, tmp_path: Path) -> 
         np.save(tmp_path / name, content)
     else:
         (tmp_path / name).write_text(content if isinstance(content, str) else json.dumps(content))
-    entry: dict[str, Any] = {"depth": "a.png", "camera": {"xyz": [0, 0, 0], "wxyz": [1, 0, 0, 0]}}
+    entry: dict[str, Any] = {"depth": "a.png", "camera": CAMERA}
     if name.startswith("camera"):
         entry["intrinsics"] = name
     [view], _ = read_views([entry], tmp_path)
     assert view.intrinsics == K
 
 
-CAMERA = {"xyz": [0, 0, 0], "wxyz": [1, 0, 0, 0]}
-
-
-@pytest.mark.parametrize(
-    ("entry", "message"),
-    [
+def test_what_is_wrong_in_a_file(tmp_path: Path) -> None:
+    for name in "abc":
+        Image.fromarray(np.full((6, 8), 1500, np.uint16)).save(tmp_path / f"{name}.png")
+    (tmp_path / "b.json").write_text('{"K": [1.0, 2.0]}')
+    (tmp_path / "c.json").write_text('{"fx": "wide", "fy": 1.0, "cx": 1.0, "cy": 1.0}')
+    for entry, message in (
         ({"cloud": "a.ply", "camera": {}, "scale": 1}, r"unknown field of views\[0\]"),
         ({"cloud": "a.ply", "camera": CAMERA | {"xyz": [0, 0]}}, r"views\[0\]: camera.xyz"),
         ({"cloud": "a.ply", "camera": CAMERA}, "a.ply does not exist"),
@@ -178,14 +175,8 @@ CAMERA = {"xyz": [0, 0, 0], "wxyz": [1, 0, 0, 0]}
         ({"depth": "a.png", "camera": CAMERA}, r"views\[0\] has no intrinsics"),
         ({"depth": "b.png", "camera": CAMERA}, "b.json holds no intrinsics"),
         ({"depth": "c.png", "camera": CAMERA}, "view.intrinsics is"),
-    ],
-)
-def test_what_is_wrong_in_a_file(entry: object, message: str, tmp_path: Path) -> None:
-    for name in "abc":
-        Image.fromarray(np.full((6, 8), 1500, np.uint16)).save(tmp_path / f"{name}.png")
-    (tmp_path / "b.json").write_text('{"K": [1.0, 2.0]}')
-    (tmp_path / "c.json").write_text('{"fx": "wide", "fy": 1.0, "cx": 1.0, "cy": 1.0}')
-    refuses(message, read_views, [entry], tmp_path)
+    ):
+        refuses(message, read_views, [entry], tmp_path)
 
 
 def test_points_that_were_seen_are_sampled_as_a_cloud() -> None:
@@ -193,12 +184,6 @@ def test_points_that_were_seen_are_sampled_as_a_cloud() -> None:
     points = np.random.default_rng(0).uniform(0.2, 0.5, (50, 3))
     found = sample_surface(rd.Scene([SeenPoints(points, 0.01)]), 20, np.random.default_rng(1))
     assert len(found) == 20 and all((point == points).all(axis=1).any() for point in found)
-
-
-def test_intrinsics_as_a_mapping_or_a_matrix() -> None:
-    each: list[Any] = [K, dict(zip(("fx", "fy", "cx", "cy"), K, strict=True)), MATRIX, np.array(MATRIX)]
-    for given in each:
-        assert rd.DepthView(np.ones((2, 2)), given, np.eye(4)).intrinsics == K
 
 
 def test_small_images_cannot_fill_the_memory(tmp_path: Path) -> None:

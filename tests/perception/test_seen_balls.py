@@ -95,28 +95,20 @@ def test_balls_lie_within_voxels_if_all_of_them_do() -> None:
     assert 0.02 < within.mean() < 0.9
 
 
-def test_balls_cover_the_surface_of_the_arm_and_of_what_it_holds() -> None:
+def test_balls_cover_the_surface_of_the_arm_and_what_it_holds_and_the_spheres_of_a_link_without_meshes() -> None:
     held = PANDA.attach(rd.Box((0, 0, 0.1), (0.04, 0.06, 0.1), name="held"), "panda_hand")
-    points = dict[str, np.ndarray]()
+    covered = list[tuple[rd.Robot, str, np.ndarray]]()
     for link in ("panda_link3", "panda_hand", "held"):
         corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in held.meshes[link]])
         corners = corners[RNG.integers(len(corners), size=400)]
-        points[link] = (RNG.dirichlet((1, 1, 1), 400)[:, None] @ corners)[:, 0]
-    check_covered(held, points)
+        covered.append((held, link, (RNG.dirichlet((1, 1, 1), 400)[:, None] @ corners)[:, 0]))
     assert len(visibility.surface_balls(held, Q)) > len(visibility.surface_balls(PANDA, Q))
-
-
-def test_balls_cover_the_spheres_of_a_link_without_meshes() -> None:
     bare = replace(PANDA, meshes={}, spheres={link: PANDA.spheres[link] for link in ("panda_hand",)})
     ways = RNG.standard_normal((200, 3))
     ways /= np.linalg.norm(ways, axis=1)[:, None]
     spheres = bare.spheres["panda_hand"]
-    check_covered(bare, {"panda_hand": (spheres[:, None, :3] + spheres[:, None, 3:] * ways).reshape(-1, 3)})
-
-
-def check_covered(robot: rd.Robot, points: dict[str, np.ndarray]) -> None:
-    """Asserts that points, given in the frames of links, are within the arm's balls at Q."""
-    tree = KDTree(visibility.surface_balls(robot, Q))
-    for link, of_link in points.items():
+    covered.append((bare, "panda_hand", (spheres[:, None, :3] + spheres[:, None, 3:] * ways).reshape(-1, 3)))
+    for robot, link, points in covered:
         T = robot.fk(Q, link)
-        assert tree.query(of_link @ T[:3, :3].T + T[:3, 3])[0].max() <= visibility.BALL_RADIUS
+        away, _ = KDTree(visibility.surface_balls(robot, Q)).query(points @ T[:3, :3].T + T[:3, 3])
+        assert away.max() <= visibility.BALL_RADIUS, (link, len(robot.meshes))

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from helpers.commands import Said
 from helpers.refusals import refuses
 from robotdiffuse import Box, PlanResult, Problem, Scene, load_planner, load_robot, next_view
-from robotdiffuse.cli import main
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.perception.visibility import ARM_CELL, seen_weights
@@ -92,10 +92,9 @@ def test_it_looks_from_where_nothing_is_in_the_way(problem: Problem, result: Pla
     assert next_view(seen_twice, result, [ABOVE]).seen < found.seen
 
 
-def test_misuse_is_refused(problem: Problem, result: PlanResult, capsys: pytest.CaptureFixture) -> None:
+def test_misuse_is_refused(problem: Problem, result: PlanResult, said: Said) -> None:
     refuses("has no views", next_view, Problem(PANDA, Scene(), START, GOAL), result)
     refuses("poses is empty", next_view, problem, result, [])
     refuses("no motion", next_view, problem, replace(result, path=None, trajectory=None))
     refuses("T_base_camera", next_view, problem, result, [2 * np.eye(4)])
-    assert main(["plan", "examples/two_spheres.yaml", "--next-view"]) == 2
-    assert "--next-view needs a problem with views" in capsys.readouterr().err
+    assert "--next-view needs a problem with views" in said(2, "plan", "examples/two_spheres.yaml", "--next-view")

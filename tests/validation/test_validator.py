@@ -193,18 +193,13 @@ def test_limits_start_and_goal() -> None:
     assert refused(rd.verify(*problem_and_path(SWING + np.array([[0, 0, 0], [0, 0, np.nan]]))), "not_finite").time == 1
 
 
-def test_the_earliest_of_different_violations_is_reported() -> None:
+def test_the_earliest_of_different_violations_is_reported_unless_collision_alone_is_asked_for() -> None:
     rows = np.array([[-0.6, 0, 0], [0.6, 0, 0], [0.6, 2.9, 0]])
+    path = rd.Path(box_arm().joint_names, rows)
     for shapes, kind in (([rd.Sphere(vector(1.2, 0, 0), 0.05)], "scene_collision"), ([], "limits")):
         problem = rd.Problem(box_arm(), rd.Scene(shapes), rows[0], rd.JointGoal(rows[:1]))
-        refused(rd.verify(problem, rd.Path(box_arm().joint_names, rows)), kind)
-
-
-def test_paths_of_another_shape_or_other_joints_raise() -> None:
-    for rows in (np.zeros((0, 3)), np.zeros((2, 4))):
-        refuses(r"path.positions has shape .* it must be n x 3 with n >= 1", rd.verify, *problem_and_path(rows))
-    problem, path = problem_and_path(SWING)
-    refuses(r"path.joint_names is j2, j1, j0; .* are j0, j1, j2", rd.verify, problem, rd.Path(path.joint_names[::-1], SWING))
+        refused(rd.verify(problem, path), kind)
+        assert verifier(replace(problem, start=rows[1]), VerifySettings()).collision_free(path) == (kind == "limits")
 
 
 @pytest.mark.parametrize("spacing", [0.3, 0.02])
@@ -273,7 +268,11 @@ def test_trajectories_that_jump_or_run_backwards() -> None:
     refused(verified(trajectory(3e9)), "time")
 
 
-def test_wrong_shapes_of_a_trajectory_raise() -> None:
+def test_motions_of_another_shape_or_other_joints_raise() -> None:
+    for rows in (np.zeros((0, 3)), np.zeros((2, 4))):
+        refuses(r"path.positions has shape .* it must be n x 3 with n >= 1", rd.verify, *problem_and_path(rows))
+    problem, path = problem_and_path(SWING)
+    refuses(r"path.joint_names is j2, j1, j0; .* are j0, j1, j2", rd.verify, problem, rd.Path(path.joint_names[::-1], SWING))
     for name, cut in (
         ("times", lambda times: times[0]),
         ("velocities", lambda rates: rates[1:]),
@@ -283,7 +282,7 @@ def test_wrong_shapes_of_a_trajectory_raise() -> None:
     ):
         good = trajectory(2.0)
         object.__setattr__(good, name, np.asarray(cut(getattr(good, name))))
-        refuses(rf"trajectory\.{name} has shape .*; it must be", verify_trajectory, problem_and_path(SWING)[0], good)
+        refuses(rf"trajectory\.{name} has shape .*; it must be", verify_trajectory, problem, good)
 
 
 @pytest.mark.parametrize(("factor", "jumps"), [(1.0, False), (1.02, False), (1.49, False), (1.6, True)])
@@ -296,17 +295,14 @@ def test_times_compressed_under_rates_of_zero(factor: float, jumps: bool) -> Non
     assert wrong_rates(quick, strong(1e3)).keys() == {"velocity", "acceleration", "rates", *(["jump"] if jumps else [])}
 
 
-@pytest.mark.parametrize("factor", [-1, 0])
-def test_rates_that_are_not_those_of_the_positions(factor: float) -> None:
+def test_rates_that_are_not_those_of_the_positions() -> None:
     good = trajectory(1.0)
-    found = wrong_rates(replace(good, velocities=factor * good.velocities))
-    assert found.keys() == {"rates", "velocity", "acceleration"} and "veloc" in found["rates"]
-    found = wrong_rates(replace(good, accelerations=factor * good.accelerations))
-    assert found.keys() == {"rates"} and "accel" in found["rates"]
-
-
-def test_the_rate_in_a_message_has_its_sign() -> None:
-    good = trajectory(1.0)
+    for factor in (-1, 0):
+        found = wrong_rates(replace(good, velocities=factor * good.velocities))
+        assert found.keys() == {"rates", "velocity", "acceleration"} and "veloc" in found["rates"]
+        found = wrong_rates(replace(good, accelerations=factor * good.accelerations))
+        assert found.keys() == {"rates"} and "accel" in found["rates"]
+    # the rate in a message has its sign
     ways = (good.positions, good.positions[::-1])
     messages = [wrong_rates(replace(good, positions=q, velocities=0 * q, accelerations=0 * q))["rates"] for q in ways]
     there, back = (float(message.split(" is ")[1].split(",")[0]) for message in messages)
@@ -391,24 +387,13 @@ def test_rows_far_apart_are_validated_as_controllers_move_between_them() -> None
     assert np.abs(positions[:, 0]).max() == pytest.approx(0.75, abs=1e-3)
 
 
-def test_collision_alone_can_be_asked_for() -> None:
-    """Limits, start and goal are not checked."""
-    problem, path = problem_and_path(np.array([[-0.6, 0, 0], [0.6, 0, 0], [0.6, 2.9, 0]]))
-    assert verifier(problem, VerifySettings()).collision_free(path)
-    blocked = replace(problem, scene=rd.Scene([rd.Sphere(vector(1.2, 0, 0), 0.05)]))
-    assert not verifier(blocked, VerifySettings()).collision_free(path)
-
-
 def test_jerk_is_reported_and_not_required() -> None:
     robot = rd.load_robot("ur5e")
     rows = np.array([[0.0, -1.5, 1.5, -1.5, -1.5, 0.0], [1.0, -1.2, 1.0, -1.5, -1.0, 0.0]])
     problem = rd.Problem(robot, rd.Scene(), rows[0], rd.JointGoal(rows[-1:]))
-    reports = [
-        rd.verify(
-            problem, time_parameterize(robot, rd.Path(robot.joint_names, rows), yes, yes, TimingSettings(jerk=jerk)).trajectory
-        )
-        for jerk in (None, np.inf)
-    ]
+    path = rd.Path(robot.joint_names, rows)
+    timings = (time_parameterize(robot, path, yes, yes, TimingSettings(jerk=jerk)) for jerk in (None, np.inf))
+    reports = [rd.verify(problem, timing.trajectory) for timing in timings]
     limited, free = [report.jerk_share for report in reports]
     assert all(report.valid for report in reports) and limited is not None and free is not None
     assert 0.5 < limited <= 1 + 1e-6 < 5 < free

@@ -9,11 +9,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-import robotdiffuse as rd
+from helpers.commands import Said
 from helpers.panda import PANDA
 from helpers.refusals import refuses
 from helpers.stores import random_motions, write_motions
-from robotdiffuse.cli import main
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.learning.checkpoint import load_network
@@ -55,23 +54,21 @@ def test_training_learns(data: str, tmp_path: Path) -> None:
 
 
 def test_weights_of_another_robot_or_none_are_refused(data: str, tmp_path: Path) -> None:
-    with pytest.raises(rd.InputError, match="no weights of the network reversal come with the package for panda; train them"):
-        load_network("reversal", None, PANDA)
-    with pytest.raises(rd.InputError, match="holds no reversal; train them: robotdiffuse train baseline reversal"):
-        load_network("reversal", str(tmp_path), PANDA)
+    message = "no weights of the network reversal come with the package for panda; train them"
+    refuses(message, load_network, "reversal", None, PANDA)
+    message = "holds no reversal; train them: robotdiffuse train baseline reversal"
+    refuses(message, load_network, "reversal", str(tmp_path), PANDA)
     train_baseline(baseline_training("reversal", {"data": data, "samples": 160}), str(tmp_path / "out"))
     narrow = PANDA.with_locked({"panda_joint7": 0.0})
     refuses("was trained for panda with joints", load_network, "reversal", str(tmp_path / "out"), narrow)
 
 
-def test_command(data: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    asked = ["train", "baseline", "reversal", "--data", data, "--out", str(tmp_path / "out")]
-    assert main([*asked, "--samples", "320"]) == 0
-    assert "samples: 320" in capfd.readouterr().out
-    assert main([*asked, "--samples", "320", "--batch-size", "8"]) == 2
-    assert "is of a run with batch = 16" in capfd.readouterr().err
-    assert main(["train", "baseline", "nonsense", "--data", data, "--out", "x"]) == 2
-    assert "unknown network 'nonsense'; known: completion, model, mpinets, mpnet" in capfd.readouterr().err
+def test_command(data: str, tmp_path: Path, said: Said) -> None:
+    asked = ("train", "baseline", "reversal", "--data", data, "--out", tmp_path / "out", "--samples", 320)
+    assert "samples: 320" in said(0, *asked)
+    assert "is of a run with batch = 16" in said(2, *asked, "--batch-size", 8)
+    error = said(2, "train", "baseline", "nonsense", "--data", data, "--out", "x")
+    assert "unknown network 'nonsense'; known: completion, model, mpinets, mpnet" in error
 
 
 @pytest.mark.parametrize("name", sorted(NETWORKS.keys() - {"completion"}))

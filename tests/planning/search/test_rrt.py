@@ -27,15 +27,12 @@ from robotdiffuse.trajectories.timing import Timing, time_parameterize
 
 WALL = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8], name="wall")])
 AROUND = rd.Problem(PANDA, WALL, LEFT, RIGHT)
-
-
-def ends() -> tuple[np.ndarray, np.ndarray]:
-    return LEFT.astype(np.float32), RIGHT[None].astype(np.float32)
+ENDS = LEFT.astype(np.float32), RIGHT[None].astype(np.float32)
 
 
 def test_paths_are_below_the_bound_and_join_the_ends() -> None:
     space = search_space(CollisionChecker(PANDA, WALL), 0.04)
-    start, goals = ends()
+    start, goals = ENDS
     longest = np.float32(1.0)
     bound = np.float32(np.inf)
     found = 0
@@ -157,7 +154,7 @@ def test_simplification_keeps_ends_and_freedom_and_does_not_lengthen() -> None:
     space = search_space(CollisionChecker(PANDA, WALL), 0.04)
     for seed in range(5):
         state = random_state(seed)
-        trees = rrt_kernel.make_trees(*ends(), 5_000)
+        trees = rrt_kernel.make_trees(*ENDS, 5_000)
         path = rrt_kernel.search(space, None, trees, rrt_kernel.INFINITE, np.float32(1.0), 100_000, state)
         simplified = [
             tighten(space, simplify(space, path, rounds), tries, state) for rounds, tries in ((0, 0), (1, 0), (4, 10), (1, 300))
