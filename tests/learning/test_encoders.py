@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.box_arm import box_arm
+from helpers.commands import Said
 from helpers.refusals import refuses
 from helpers.stores import manifest_of, random_arrays
-from robotdiffuse.cli import main
 from robotdiffuse.datasets.shards import write_manifest, write_shard
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning import encoders
@@ -189,9 +189,8 @@ def test_edge_convolution_is_the_maximum_over_edges():
 @pytest.mark.parametrize("name", ALONE)
 def test_training_alone(name, tmp_path, monkeypatch):
     monkeypatch.setattr(training, "STANDARDIZATION_SCENES", 256)
-    training_settings = EncoderTraining(
-        name=name, minutes=None, samples=1600, batch=16, points=64, warmup_steps=10, encoder=SMALL[name]
-    )
+    short: dict[str, Any] = {"samples": 1600, "batch": 16, "points": 64, "warmup_steps": 10}
+    training_settings = EncoderTraining(name=name, minutes=None, encoder=SMALL[name], **short)
     drawn = set()
 
     def clouds(*given):
@@ -215,15 +214,13 @@ def test_training_alone(name, tmp_path, monkeypatch):
     torch.testing.assert_close(z.std(0), torch.ones(8), atol=0.35, rtol=0)
 
 
-def test_training_from_the_command_line(tmp_path, capsys, monkeypatch):
+def test_training_from_the_command_line(tmp_path, said: Said, monkeypatch):
     monkeypatch.setattr(training, "STANDARDIZATION_SCENES", 32)
     out = str(tmp_path / "out")
     command = ["train", "encoder", "--samples", "4", "--batch-size", "2", "--out", out, "--encoder"]
-    assert main([*command, "compression_autoencoder"]) == 0
-    assert "reconstruction: " in capsys.readouterr().out
+    assert "reconstruction: " in said(0, *command, "compression_autoencoder")
     assert load_encoder(out).settings == encoders.CompressionAutoencoderSettings()
-    assert main([*command, "pointnett"]) == 2
-    assert "known: compression_autoencoder, point_autoencoder" in capsys.readouterr().err
+    assert "known: compression_autoencoder, point_autoencoder" in said(2, *command, "pointnett")
 
 
 @pytest.fixture
@@ -237,10 +234,8 @@ def data(tmp_path, monkeypatch):
 
 
 def planner(data, encoder, **changes) -> PlannerTraining:
-    planned = PlannerTraining(
-        data=str(data), encoder=encoder, minutes=None, samples=96, batch=16, warmup_steps=1,
-        validation_problems=1, **denoiser_for(encoder),
-    )  # fmt: skip
+    sizes: dict[str, Any] = {"samples": 96, "batch": 16, "warmup_steps": 1, "validation_problems": 1}
+    planned = PlannerTraining(data=str(data), encoder=encoder, minutes=None, **sizes, **denoiser_for(encoder))
     return replace(planned, **changes)
 
 
@@ -251,8 +246,7 @@ def test_joint_training_changes_the_encoder(name, data, tmp_path):
     fresh = small(name)
     train_planner(planned, str(tmp_path / "out"))
     model = load_network("model", tmp_path / "out", box_arm())
-    assert type(model.encoder) is encoders.ENCODERS.load(name)
-    assert model.encoder is not None
+    assert model.encoder is not None and type(model.encoder) is encoders.ENCODERS.load(name)
     trained = dict(model.encoder.named_parameters())
     moved = {key for key, p in fresh.named_parameters() if (trained[key] - p).abs().max() > 3e-4}
     own = ("decoder", "query") if name in ALONE else ()  # what only reconstructs takes no part

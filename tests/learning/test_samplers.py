@@ -115,11 +115,8 @@ def test_against_diffusers(name, steps, eta):
     schedule = cosine_schedule()
     levels = schedule.sampling_levels(steps).tolist()
     alpha_bar = schedule.signal**2
-    vp = {
-        "num_train_timesteps": schedule.steps,
-        "trained_betas": 1 - alpha_bar[1:] / alpha_bar[:-1],
-        "prediction_type": "sample",
-    }
+    betas = 1 - alpha_bar[1:] / alpha_bar[:-1]
+    vp = {"num_train_timesteps": schedule.steps, "trained_betas": betas, "prediction_type": "sample"}
     if name == "ddpm":
         scheduler = diffusers.DDPMScheduler(**vp, clip_sample=False)
         scheduler.set_timesteps(timesteps=[level - 1 for level in levels[:-1]])

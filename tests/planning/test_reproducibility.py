@@ -1,8 +1,5 @@
 """The same seed gives the same motion: in a second call, and in a process with another number of threads."""
 
-import os
-import subprocess
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -10,19 +7,19 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.commands import python
 from robotdiffuse.validation.report import Report, Violation
 from robotdiffuse.validation.validator import Verifier
 
-SOURCE = Path(__file__).parents[2] / "src" / "robotdiffuse"
-SHELF = SOURCE / "examples" / "shelf.yaml"
+SHELF = Path(__file__).parents[2] / "src" / "robotdiffuse" / "examples" / "shelf.yaml"
 PLANNERS = ("rrt_connect", "aorrtc", "shared_tree_rrt_star", "diffusion", "robotdiffuse")
-TWICE = """
-import hashlib, sys
+TWICE = f"""
+import hashlib
 import robotdiffuse as rd
 from robotdiffuse.core.loading import compiled
 
-problem = rd.load_problem(sys.argv[1])
-for name in sys.argv[2:]:
+problem = rd.load_problem({str(SHELF)!r})
+for name in {PLANNERS}:
     planner = rd.load_planner(name)
     for _ in range(2):
         motion = planner.plan(problem, 60.0, seed=3).trajectory
@@ -35,14 +32,7 @@ def motions(threads: int) -> list[str]:
     """A line for each motion, by a process that does not compile: in one that compiles, the last bits may differ."""
     counts = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS"), str(threads))
     for _ in range(2):
-        done = subprocess.run(
-            [sys.executable, "-c", TWICE, str(SHELF), *PLANNERS],
-            env=os.environ | counts | {"PYTHONPATH": str(SOURCE.parent)},
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == 0, done.stderr
-        *lines, compiled = done.stdout.splitlines()
+        *lines, compiled = python(TWICE, 0, **counts).stdout.splitlines()
         if compiled == "compiled 0":
             break
     return lines

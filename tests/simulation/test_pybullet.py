@@ -16,7 +16,7 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm, box_mesh
 from helpers.commands import Said, python
 from helpers.example_robots import example_robot
-from helpers.panda import PANDA
+from helpers.panda import HOME, PANDA
 from helpers.refusals import refuses
 from helpers.sphere_oracles import solids
 from robotdiffuse.collision.exact_meshes import ExactCollision
@@ -86,11 +86,12 @@ def test_contact_is_reported_where_the_motion_runs_into_an_obstacle() -> None:
 
 def test_links_that_touch_each_other_are_reported() -> None:
     robot = box_arm()
-    run = replay(robot, rd.Scene(), motion(robot, np.zeros(3), np.array([0.0, 2.7, 2.0])))
+    folding = motion(robot, np.zeros(3), np.array([0.0, 2.7, 2.0]))
+    run = replay(robot, rd.Scene(), folding)
     assert {(contact.link, contact.other) for contact in run.contacts} <= {("l1", "l3"), ("l3", "l1")}
     assert not run.free
     allowed = replace(robot, allowed_collisions=robot.allowed_collisions | {frozenset(("l1", "l3"))})
-    assert replay(allowed, rd.Scene(), motion(robot, np.zeros(3), np.array([0.0, 2.7, 2.0]))).free
+    assert replay(allowed, rd.Scene(), folding).free
 
 
 def test_skew_axes_sliding_joints_and_a_branch() -> None:
@@ -115,10 +116,6 @@ def result_file(folder: FilePath, scene: rd.Scene) -> str:
     result = rd.PlanResult(rd.Status.SOLVED, "by hand", "none", "panda", 0.0, 0, path=rows, trajectory=trajectory)
     result.save(folder / "result.json", problem_record(rd.Problem(PANDA, scene, PANDA_START, goal)))
     return str(folder / "result.json")
-
-
-def test_importing_pybullet_without_standard_output() -> None:
-    python("import os; os.close(1); import robotdiffuse.simulation")
 
 
 def test_a_world_that_fails_to_load_leaves_no_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,16 +190,11 @@ def test_only_the_build_time_is_left_out(tmp_path: FilePath) -> None:
     (tmp_path / "pybullet.py").write_text(PYBULLET)
     ended = python(f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import robotdiffuse.simulation")
     assert ended.stdout == "printed by another thread\n" and ended.stderr == ""
+    python("import os; os.close(1); import robotdiffuse.simulation")  # without standard output
 
 
 TOLERANCE = 7e-4
 """Most distances agree to 5e-6 m; Bullet rounds the edges of its boxes and cylinders by up to 0.6 mm."""
-
-
-def every_shape() -> rd.Scene:
-    torus = trimesh.creation.torus(0.2, 0.05, major_sections=16, minor_sections=8)
-    mesh = rd.Mesh(torus.vertices.view(np.ndarray), torus.faces, (-0.3, 0.4, 0.7), (0.5, 0.1, 0.2, 0.9))
-    return rd.Scene([*solids().shapes, mesh])
 
 
 def far_pairs_only(robot: rd.Robot) -> rd.Robot:
@@ -227,7 +219,9 @@ def test_distances_agree_with_coal(name: str, locked: dict[str, float]) -> None:
 
 def test_collisions_agree_with_coal_meshes_included() -> None:
     robot = far_pairs_only(example_robot("panda"))
-    scene = every_shape()
+    torus = trimesh.creation.torus(0.2, 0.05, major_sections=16, minor_sections=8)
+    mesh = rd.Mesh(torus.vertices.view(np.ndarray), torus.faces, (-0.3, 0.4, 0.7), (0.5, 0.1, 0.2, 0.9))
+    scene = rd.Scene([*solids().shapes, mesh])
     exact = ExactCollision(robot, scene)
     q = np.random.default_rng(1).uniform(robot.lower, robot.upper, (150, robot.dof))
     hits = exact.collides(q)
@@ -282,10 +276,9 @@ def test_scenes_are_replaced_and_the_robot_stays() -> None:
 
 
 def test_obstacles_at_links_that_do_not_move_are_nothing() -> None:
-    robot = far_pairs_only(example_robot("panda"))
-    q = np.array([[0, -0.785, 0, -2.356, 0, 1.571, 0.785]])
-    with PyBulletOracle(robot, rd.Scene([rd.Box((0, 0, -0.05), (2, 2, 0.12), name="floor")])) as oracle:
-        assert oracle.check_rows(q) is None and oracle.nearest(q[0], 0.0) is None
+    floor = rd.Box((0, 0, -0.05), (2, 2, 0.12), name="floor")
+    with PyBulletOracle(far_pairs_only(example_robot("panda")), rd.Scene([floor])) as oracle:
+        assert oracle.check_rows(HOME[None]) is None and oracle.nearest(HOME, 0.0) is None
 
 
 def test_point_clouds_agree_with_coal() -> None:

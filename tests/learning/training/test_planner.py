@@ -38,6 +38,8 @@ from robotdiffuse.scenes.surface_points import sample_surface
 
 SMALL_DENOISER = TransformerSettings(width=32, layers=2, heads=2, hidden=48, patch=8)
 WAYPOINTS = 48
+START = np.array([-1.0, 0.2, 0.5])
+GOAL = np.array([1.0, -0.3, 0.4])
 
 
 def planner_settings(data, **changes) -> PlannerTraining:
@@ -170,13 +172,11 @@ def test_every_choice_trains_and_plans(changes, tmp_path, data, arm, monkeypatch
     losses = [float(row["loss"]) for row in read_log(out)]
     assert np.mean(losses[-3:]) < losses[0]
     model = exported_model("model", out, arm)
-    start = np.array([-1.0, 0.2, 0.5])
-    goal = np.array([1.0, -0.3, 0.4])
     z = model.encode(np.zeros((0, 3)))
     settings = SamplingSettings(samples=3, sampling_steps=8)
-    q = model.sample(start, goal, z, nothing_near, np.random.default_rng(0), settings)
+    q = model.sample(START, GOAL, z, nothing_near, np.random.default_rng(0), settings)
     assert q.shape == (3, WAYPOINTS, 3) and np.isfinite(q).all()
-    assert (q[:, 0] == start).all() and (q[:, -1] == goal).all()
+    assert (q[:, 0] == START).all() and (q[:, -1] == GOAL).all()
     assert (q >= arm.lower).all() and (q <= arm.upper).all()
 
 
@@ -213,8 +213,6 @@ def test_planner_learns_which_side(tmp_path, data, arm):
     loaded = load_data(str(data), arm, model.encoder, WAYPOINTS, print)
     assert about["training"]["trajectories"] == len(loaded)
     rng = np.random.default_rng(0)
-    start = np.array([-1.0, 0.2, 0.5])
-    goal = np.array([1.0, -0.3, 0.4])
     for side in (-1.0, 1.0):
         scene = rd.Scene([rd.Box([0, 0, -0.05], [2, 2, 0.1]), rd.Sphere([0.0, 0.5 * side, 1.0], 0.2)])
         z = model.encode(sample_surface(scene, 256, rng))
@@ -223,22 +221,23 @@ def test_planner_learns_which_side(tmp_path, data, arm):
         def clearances(q, checker=checker):
             return checker.link_clearances(q.reshape(-1, 3)).reshape(*q.shape[:2], 3)
 
-        q = model.sample(start, goal, z, clearances, rng, SamplingSettings(samples=4))
-        bow = q[:, WAYPOINTS // 2] - (start + goal) / 2
+        q = model.sample(START, GOAL, z, clearances, rng, SamplingSettings(samples=4))
+        bow = q[:, WAYPOINTS // 2] - (START + GOAL) / 2
         assert (bow * side > 0.1).all()
         np.testing.assert_allclose(bow.mean(), 0.5 * side, atol=0.2)
 
 
 @pytest.mark.usefixtures("no_export")
 def test_other_settings_and_a_damaged_checkpoint_are_refused(tmp_path, data):
-    train_planner(planner_settings(data, samples=16), str(tmp_path / "out"))
-    with pytest.raises(rd.InputError, match=r"learning_rate = 0\.003, now it is 0\.1"):
-        train_planner(planner_settings(data, learning_rate=0.1), str(tmp_path / "out"))
-    with lock_folder(tmp_path / "out"), pytest.raises(rd.InputError, match="another process"):
-        train_planner(planner_settings(data), str(tmp_path / "out"))
+    out = str(tmp_path / "out")
+    train_planner(planner_settings(data, samples=16), out)
+    again = train_planner, planner_settings(data), out
+    refuses(r"learning_rate = 0\.003, now it is 0\.1", train_planner, planner_settings(data, learning_rate=0.1), out)
+    with lock_folder(tmp_path / "out"):
+        refuses("another process", *again)
     file = tmp_path / "out" / "training.safetensors"
     file.write_bytes(file.read_bytes()[:1000])
-    refuses(r"training\.safetensors is damaged", train_planner, planner_settings(data), str(tmp_path / "out"))
+    refuses(r"training\.safetensors is damaged", *again)
 
 
 @pytest.mark.usefixtures("no_export")
