@@ -1,7 +1,5 @@
 """Controls: the straight line, fixed vias, nearest motions, smooth noise."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -39,7 +37,7 @@ def test_vias_are_free_and_on_the_candidates() -> None:
     refuses("only the panda", controls.fixed_vias, planar_arm(0.5, 0.4))
 
 
-def test_the_nearest_motions_are_bent_to_start_and_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_nearest_motions_need_data_and_are_bent_to_start_and_goal(monkeypatch: pytest.MonkeyPatch) -> None:
     ends = np.array([[[0.0, 0.0], [1.0, 1.0]], [[3.0, 0.0], [0.1, 0.0]]])
     motions = np.stack([ends[:, 0], ends.mean(1) + np.array([0.0, 0.5]), ends[:, 1]], axis=1)
     start, goal = np.array([0.0, 0.1]), np.array([3.0, 0.0])
@@ -52,11 +50,8 @@ def test_the_nearest_motions_are_bent_to_start_and_goal(monkeypatch: pytest.Monk
     control = controls.Control(controls.ControlSettings(source=controls.NEAREST, data="data", samples=1, guidance_steps=0))
     q = control.candidates(LEFT, RIGHT[None], CollisionChecker(PANDA, WALL), np.random.default_rng(0))
     np.testing.assert_allclose(q, [[LEFT, RIGHT]])
-
-
-def test_data_are_for_the_nearest_motions_alone(tmp_path: Path) -> None:
     refuses("needs data", controls.ControlSettings, source=controls.NEAREST)
-    refuses("needs data", controls.ControlSettings, data=str(tmp_path))
+    refuses("needs data", controls.ControlSettings, data="of other controls")
 
 
 MIDDLE = 0.5 * (PANDA.lower + PANDA.upper)

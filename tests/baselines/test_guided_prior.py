@@ -64,9 +64,7 @@ class Gaussian(MotionNetwork):
         return torch.nn.functional.pad(torch.from_numpy(seen.astype(np.float32)), (0, 0, 1, 1))
 
 
-@pytest.fixture(scope="module")
-def gaussian() -> Gaussian:
-    return Gaussian(RANGES, SMALL)
+GAUSSIAN = Gaussian(RANGES, SMALL)
 
 
 def data_of(count: int, waypoints: int = WAYPOINTS) -> TrajectoryData:
@@ -105,11 +103,11 @@ def test_share_of_trivial_motions() -> None:
 
 
 @pytest.mark.slow
-def test_samples_have_the_mean_and_variance_of_the_data(gaussian: Gaussian) -> None:
+def test_samples_have_the_mean_and_variance_of_the_data() -> None:
     starts, goals = (np.repeat(end[None], 300, 0) for end in (LEFT, RIGHT))
-    levels = gaussian.schedule.sampling_levels(100)[:-1]
-    q = guided_prior.sample(gaussian, starts, goals, levels, np.random.default_rng(0), lambda q, _: q)
-    x = gaussian.normalizer.to_unit(q.astype(np.float64))
+    levels = GAUSSIAN.schedule.sampling_levels(100)[:-1]
+    q = guided_prior.sample(GAUSSIAN, starts, goals, levels, np.random.default_rng(0), lambda q, _: q)
+    x = GAUSSIAN.normalizer.to_unit(q.astype(np.float64))
     t = np.linspace(0, 1, WAYPOINTS)[:, None]
     bump = x - ((1 - t) * x[:, :1] + t * x[:, -1:])
     # joints whose bumps are clipped at the limits say nothing about the sampler
@@ -133,13 +131,13 @@ def test_samples_hold_their_ends_exactly() -> None:
     assert np.all(q >= PANDA.lower - 1e-5) and np.all(q <= PANDA.upper + 1e-5)
 
 
-def test_the_guide_gets_the_number_of_steps_to_come(gaussian: Gaussian) -> None:
+def test_the_guide_gets_the_number_of_steps_to_come() -> None:
     guide = Mock(side_effect=lambda q, left: q)
     ends = LEFT[None], RIGHT[None]
-    guided_prior.sample(gaussian, *ends, np.array([255, 90, 1]), np.random.default_rng(0), guide, quiet_steps=2)
+    guided_prior.sample(GAUSSIAN, *ends, np.array([255, 90, 1]), np.random.default_rng(0), guide, quiet_steps=2)
     assert [call.args[1] for call in guide.call_args_list] == [2, 1, 0, 0, 0]
     with deadline(lambda: 0.0), pytest.raises(OutOfTimeError):
-        guided_prior.sample(gaussian, *ends, np.array([255, 1]), np.random.default_rng(0), guide)
+        guided_prior.sample(GAUSSIAN, *ends, np.array([255, 1]), np.random.default_rng(0), guide)
     assert guide.call_count == 5
 
 
@@ -235,9 +233,9 @@ def test_each_guide_moves_only_its_rows() -> None:
 
 
 @pytest.fixture(params=["mpd", "edmp"])
-def planner(request: pytest.FixtureRequest, gaussian: Gaussian, monkeypatch: pytest.MonkeyPatch):
+def planner(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch):
     made = guided_prior.MPD() if request.param == "mpd" else guided_prior.EDMP()
-    monkeypatch.setattr(made, "network", lambda _robot: gaussian)
+    monkeypatch.setattr(made, "network", lambda _robot: GAUSSIAN)
     return made
 
 

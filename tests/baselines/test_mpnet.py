@@ -24,11 +24,12 @@ from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 UP = np.array([0.0, -0.9, 0.0, -1.9, 0.0, 2.2, 0.785])
 WALL = Scene([Box([0.5, 0.0, 0.2], [0.3, 0.05, 0.4], name="wall")])
+PROBLEM = Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None]))
 SMALL = MPNetSettings(points=40, encoder_layers=(32, 16), code=8, decoder_layer=16, layers=(64, 64, 32), steady_layers=1)
 
 
-def network(settings: MPNetSettings = SMALL, seed: int = 0) -> MPNetNetwork:
-    torch.manual_seed(seed)
+def network(settings: MPNetSettings = SMALL) -> MPNetNetwork:
+    torch.manual_seed(0)
     return MPNetNetwork(RobotIdentity.of(PANDA), settings)
 
 
@@ -57,15 +58,10 @@ def weights(tmp_path_factory) -> str:
     return str(folder)
 
 
-def planning(weights: str, problem: Problem, **changes: object) -> NeuralPlanning:
-    settings = replace(MPNetPlannerSettings(weights), **changes)
-    checker = CollisionChecker(problem.robot, problem.scene)
-    start_goal = StartGoal(checker, problem.start, np.array([RIGHT]))
-    return NeuralPlanning(PlanningContext("mpnet", problem, PlanRequest(60.0)), start_goal, network(), settings)
-
-
-def wall_problem(scene: Scene = WALL) -> Problem:
-    return Problem(PANDA, scene, LEFT, JointGoal(RIGHT[None]))
+def planning(weights: str) -> NeuralPlanning:
+    start_goal = StartGoal(CollisionChecker(PANDA, WALL), LEFT, np.array([RIGHT]))
+    context = PlanningContext("mpnet", PROBLEM, PlanRequest(60.0))
+    return NeuralPlanning(context, start_goal, network(), MPNetPlannerSettings(weights))
 
 
 @pytest.mark.parametrize(("fraction", "most"), [(0.0, np.inf), (1.0, 0.8)], ids=["auto-encoder", "end to end"])
@@ -139,13 +135,13 @@ def test_dropout_is_on_in_planning_and_drawn_from_the_generator(weights: str) ->
     again = net.next_states(z, q, goal, torch.Generator().manual_seed(0))
     assert not torch.equal(first, second) and torch.equal(first, again)
     assert torch.equal(net.next_states(z, q, goal, None), net.next_states(z, q, goal, None))
-    one = planning(weights, wall_problem())
+    one = planning(weights)
     states = one.network.proposals(one.z, np.tile(LEFT, (8, 1)).astype(np.float32), one.goals[:8], one.generator)
     assert len(np.unique(states, axis=0)) == 8
 
 
 def test_replanning_keeps_what_is_free_and_leaves_out_states_in_collision(weights: str) -> None:
-    one = planning(weights, wall_problem())
+    one = planning(weights)
     middle = (LEFT + RIGHT) / 2
     path = np.array([LEFT, UP, middle, RIGHT], np.float32)
     assert not CollisionChecker(PANDA, WALL).free(middle[None])[0]
@@ -159,8 +155,8 @@ def test_replanning_keeps_what_is_free_and_leaves_out_states_in_collision(weight
 
 def test_hybrid_replanning_joins_what_the_network_does_not(weights: str) -> None:
     settings = MPNetPlannerSettings(weights, attempts=1, steps=1, replanning=0, hybrid=True)
-    results = [MPNet(settings).plan(wall_problem(), 120.0, seed=seed) for seed in (*range(6), 0)]
-    assert all(result.solved and verify(wall_problem(), result.path).valid for result in results)
+    results = [MPNet(settings).plan(PROBLEM, 120.0, seed=seed) for seed in (*range(6), 0)]
+    assert all(result.solved and verify(PROBLEM, result.path).valid for result in results)
     assert any("RRT-Connect" in result.reason for result in results)
     assert np.array_equal(results[0].path.positions, results[-1].path.positions)
 

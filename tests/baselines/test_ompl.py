@@ -62,15 +62,11 @@ def test_prm_with_many_goals_ends():
         assert result.path is not None and rd.verify(many, result.path).valid
 
 
-def corridor() -> rd.Problem:
-    walls = [rd.Box([0.8, side * 0.12, 0.0], [1.2, 0.08, 0.2]) for side in (-1, 1)]
-    return rd.Problem(box_arm(), rd.Scene(walls), np.array([2.0, 0.0, 0.0]), rd.JointGoal(np.zeros((1, 3))))
-
-
 @every
 def test_no_way_to_the_goal_times_out(planner, monkeypatch):
     monkeypatch.undo()  # OMPL has a clock of its own
-    result = planner().plan(corridor(), time_limit=0.2)
+    corridor = rd.Scene([rd.Box([0.8, side * 0.12, 0.0], [1.2, 0.08, 0.2]) for side in (-1, 1)])
+    result = planner().plan(rd.Problem(box_arm(), corridor, [2.0, 0.0, 0.0], np.zeros(3)), time_limit=0.2)
     assert result.status is rd.Status.TIMEOUT and result.path is None
     assert "no path was found" in result.reason
 
@@ -111,33 +107,21 @@ def test_a_refused_path_is_searched_again_more_closely(planner, monkeypatch):
 
 @every
 def test_an_error_below_ompl_comes_out(planner, monkeypatch):
+    checked = ompl.StartGoal(CollisionChecker(PANDA, WALL), LEFT, RIGHT[None])  # by the kernel, too
     with monkeypatch.context() as patched:
         patched.setattr(ompl, "motions_free", Mock(side_effect=RuntimeError("broken kernel")))
-        # start and goal are checked by the kernel too
-        patched.setattr("robotdiffuse.planning.planner.usable_start_goal", UncheckedStartGoal)
+        patched.setattr("robotdiffuse.planning.planner.usable_start_goal", lambda _: checked)
         with pytest.raises(RuntimeError, match="broken kernel"):
             planner().plan(problem(RIGHT), time_limit=120.0)
     assert plan(planner, problem(RIGHT)).solved
-
-
-class UncheckedStartGoal(ompl.StartGoal):
-    def __init__(self, *_):
-        self.checker = CollisionChecker(PANDA, WALL)
-        self._robot = PANDA
-        self.start = LEFT
-        self.start_lead = LEFT
-        self.goals = [RIGHT]
-        self.goal_leads = [RIGHT]
-
-
-OMPL_CHECKS = ompl.ob.MotionValidator, ompl.ob.StateValidityChecker
 
 
 def test_nothing_stays_in_memory():
     for planner, seed in product(FIRST + ANYTIME, range(3)):
         planner().plan(problem(RIGHT), time_limit=0.05, seed=seed)
     gc.collect()
-    assert not [each for each in gc.get_objects() if issubclass(type(each), OMPL_CHECKS)]
+    checks = ompl.ob.MotionValidator, ompl.ob.StateValidityChecker
+    assert not [each for each in gc.get_objects() if issubclass(type(each), checks)]
 
 
 def test_without_ompl_the_error_says_what_to_install(monkeypatch):

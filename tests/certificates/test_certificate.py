@@ -23,8 +23,8 @@ from robotdiffuse.validation.validator import VerifySettings
 SWING = np.array([[-0.6, 0.2, 0.3], [0.6, 0.2, 0.3], [0.6, 0.9, 0.3]])
 
 
-def problem_of(rows: np.ndarray, *shapes: Shape, robot: rd.Robot | None = None) -> tuple[rd.Problem, rd.Path]:
-    robot = robot or box_arm()
+def problem_of(rows: np.ndarray, *shapes: Shape) -> tuple[rd.Problem, rd.Path]:
+    robot = box_arm()
     return rd.Problem(robot, rd.Scene(shapes), rows[0], rd.JointGoal(rows[-1:])), rd.Path(robot.joint_names, rows)
 
 

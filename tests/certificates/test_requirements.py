@@ -10,19 +10,17 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
+from helpers.panda import PANDA
 from robotdiffuse.certificates.bounds import MovingProver, Stretches
 from robotdiffuse.certificates.proof import hash_of, request_parts
 from robotdiffuse.certificates.requirements import constraint_bounds
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 
-PANDA = rd.load_robot("panda")
 HAND = "panda_hand"
 START = [-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
 GOAL = [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
 TABLE = rd.Box([0.55, 0.0, 0.0], [0.5, 1.0, 0.2], name="table")
 ACROSS = rd.MovingObstacle(rd.Cylinder([0.42, 0.35, 0.4], 0.06, 0.6, name="post"), velocity=[0.25, -0.1, 0.0])
-CONE = rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.1745)
-NARROWER = rd.AxisCone(HAND, [0, 0, 1], [0, 0.3, -1], 0.1)
 ASKED: dict[str, dict[str, Any]] = {
     "line": {"constraints": [rd.CartesianLine(HAND, 0.002, 0.02, 0.2)]},
     "greatest speed": {"moving": [rd.MovingObstacle(rd.Sphere([0.6, 1.8, 0.5], 0.1, "ball"), max_speed=0.3)]},
@@ -117,10 +115,11 @@ def test_another_line_and_a_slower_one_need_another_proof() -> None:
 
 def test_paths_with_constraints_are_certified_and_with_moving_obstacles_refused(tmp_path: FilePath) -> None:
     path = rd.Path(PANDA.joint_names, np.array([START, GOAL]))
-    problem = rd.Problem(PANDA, rd.Scene([TABLE]), START, GOAL, constraints=[CONE])
+    cone, narrower = (rd.AxisCone(HAND, [0, 0, 1], [0, y, -1], angle) for y, angle in ((0.0, 0.1745), (0.3, 0.1)))
+    problem = rd.Problem(PANDA, rd.Scene([TABLE]), START, GOAL, constraints=[cone])
     rd.certify(problem, path).save(tmp_path / "certificate.json")
     certificate = rd.load_certificate(tmp_path / "certificate.json")
     assert certificate.check().differences == certificate.check(problem).differences == ()
-    refused(certificate, replace(problem, constraints=[NARROWER]), "is not shown to keep its limit")
+    refused(certificate, replace(problem, constraints=[narrower]), "is not shown to keep its limit")
     with pytest.raises(rd.InputError, match="certificates prove nothing about moving obstacles"):
         rd.certify(replace(problem, constraints=(), moving=[ACROSS]), path)

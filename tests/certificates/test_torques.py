@@ -71,10 +71,14 @@ def test_a_payload_is_proved_and_its_file_holds_without_pinocchio(tmp_path: File
     assert dict(read.torques)["panda_joint2"] == pytest.approx(87.0, rel=0.02)
 
 
-def test_paths_are_proved_to_be_held() -> None:
+def test_paths_and_motions_of_one_row_are_proved_to_be_held() -> None:
     problem, certificate = certified()
     held = rd.certify(problem, rd.Path(problem.robot.joint_names, certificate.motion.positions[[0, -1]]))
     assert held.check(problem).valid and len(held.torques) == 7
+    still = np.zeros((1, 7))
+    motion = rd.Trajectory(problem.robot.joint_names, np.zeros(1), np.array([LOW]), still, still)
+    there = replace(problem, goal=rd.JointGoal([LOW]))
+    assert rd.certify(there, motion).check(there).valid
 
 
 def test_a_peak_between_rows_needs_samples() -> None:
@@ -95,11 +99,3 @@ def test_another_payload_needs_another_proof() -> None:
         other = replace(problem, payload=payload)
         found = replace(certificate, request_parts=request_parts(other)).check(other).differences
         assert any(wanted in line for line in found), found
-
-
-def test_a_motion_of_one_row() -> None:
-    problem, _ = certified()
-    row = np.array([LOW])
-    still = np.zeros((1, 7))
-    there = replace(problem, goal=rd.JointGoal([LOW]))
-    assert rd.certify(there, rd.Trajectory(problem.robot.joint_names, np.zeros(1), row, still, still)).check(there).valid

@@ -102,7 +102,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
                 sys.modules.pop(file.stem, None)
 
 
-def test_planners_solve_and_are_validated(names: dict[str, Any]) -> None:
+def test_planners_solve_parts_of_networks_are_used_by_name_and_a_metric_is_measured(names: dict[str, Any]) -> None:
     bent = names["bent"]
     assert bent.solved and bent.planner == "one_bend" and len(bent.path.positions) == 3
     assert rd.verify(names["problem"], bent.path).valid
@@ -110,9 +110,6 @@ def test_planners_solve_and_are_validated(names: dict[str, Any]) -> None:
     sampled = names["sampled"]
     assert sampled.solved and sampled.stage == "network" and sampled.planner == "shortened_sample"
     assert rd.verify(names["problem"], sampled.path).valid
-
-
-def test_parts_of_the_learned_stack_are_used_by_name_and_a_metric_is_measured(names: dict[str, Any]) -> None:
     assert names["training"].denoiser == "by_waypoint" and names["motions"].shape == (2, 48, 7)
     assert names["embedding"].shape == (5, names["encoder"].settings.code)
     at_once = names["at_once"]

@@ -77,10 +77,6 @@ def public_functions(value: Any) -> Iterator[Callable[..., Any]]:
                 yield function
 
 
-def parameters(function: Callable[..., Any]) -> set[str]:
-    return {name for name in inspect.signature(function).parameters if name not in ("self", "cls")}
-
-
 def sections(of: Any) -> dict[str, Any]:
     """Sections of a docstring by kind, as mkdocs.yml makes griffe read them for the reference."""
     docstring = griffe.Docstring(inspect.getdoc(of) or "")
@@ -94,20 +90,17 @@ def documented(of: Any) -> set[str]:
 
 
 @pytest.mark.parametrize("name", [*NAMES, *MODULES])
-def test_parameters_and_results_are_documented(name: str) -> None:
-    for function in public_functions(public(name)):
+def test_parameters_results_and_fields_are_documented(name: str) -> None:
+    """Fields of public names by a docstring below each, or below `Args:` of the class."""
+    value = public(name)
+    for function in public_functions(value):
         assert inspect.getdoc(function), function.__qualname__
-        assert documented(function) == parameters(function), function.__qualname__
-        if inspect.signature(function).return_annotation not in (None, "None"):
+        signature = inspect.signature(function)
+        assert documented(function) == signature.parameters.keys() - {"self", "cls"}, function.__qualname__
+        if signature.return_annotation not in (None, "None"):
             [returned] = sections(function).get("returns", ())
             assert returned.annotation is None, f"{function.__qualname__}: a colon makes {returned.annotation!r} a type"
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_fields_are_documented(name: str) -> None:
-    """By a docstring below each, or below `Args:` of the class."""
-    value = public(name)
-    if dataclasses.is_dataclass(value):
+    if name in NAMES and dataclasses.is_dataclass(value):
         fields = {field.name for field in dataclasses.fields(value) if field.init}
         args = documented(value)
         assert args <= fields and fields <= {*args, *field_docstrings(value)}, name  # type: ignore[arg-type]

@@ -6,10 +6,10 @@ import subprocess
 import sys
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+import robotdiffuse as rd
 from helpers.browsers import CHROMIUM, opened
 
 ROOT = Path(__file__).parents[2]
@@ -28,15 +28,11 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_pages_load_nothing_from_the_network(site: Path) -> None:
-    pages = sorted(site.rglob("*.html"))
+def test_pages_load_nothing_from_the_network_and_draw_no_list_as_a_paragraph(site: Path) -> None:
+    pages = {page: page.read_text(encoding="utf-8") for page in site.rglob("*.html")}
     assert len(pages) > 20
-    assert [page.name for page in pages if LOADED.search(page.read_text(encoding="utf-8"))] == []
-
-
-@pytest.mark.slow
-def test_no_list_is_drawn_as_a_paragraph(site: Path) -> None:
-    paragraphs = [(page.name, text) for page in site.rglob("*.html") for text in PARAGRAPH.findall(page.read_text("utf-8"))]
+    assert [page.name for page, text in pages.items() if LOADED.search(text)] == []
+    paragraphs = [(page.name, paragraph) for page, text in pages.items() for paragraph in PARAGRAPH.findall(text)]
     assert len(paragraphs) > 500
     assert [(name, text) for name, text in paragraphs if re.search(r"\n\s*([-*]|\d+\.) ", text)] == []
 
@@ -53,20 +49,13 @@ def test_the_search_works_without_a_server(site: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_command_reference_has_every_option_and_the_readme_is_short(site: Path) -> None:
-    page = (site / "reference" / "commands.html").read_text(encoding="utf-8")
-    options = ("data generate", "--safety-distance", "robotdiffuse bench report", "--no-replays")
-    assert all(option in page for option in options)
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 130
-
-
-@pytest.mark.slow
-def test_the_python_reference_has_every_public_name(site: Path) -> None:
-    import robotdiffuse as rd
-
-    page = (site / "reference" / "python.html").read_text(encoding="utf-8")
+def test_the_references_have_every_option_and_public_name_and_the_readme_is_short(site: Path) -> None:
+    commands, python = ((site / "reference" / f"{name}.html").read_text(encoding="utf-8") for name in ("commands", "python"))
+    for option in ("data generate", "--safety-distance", "robotdiffuse bench report", "--no-replays"):
+        assert option in commands, option
     for name in dir(rd):
-        assert f'.{name}"' in page, name
+        assert f'.{name}"' in python, name
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 130
 
 
 DRAWINGS = sorted((ROOT / "docs").rglob("*.svg"))
@@ -89,31 +78,23 @@ def test_texts_do_not_overlap(drawing: Path, tmp_path: Path) -> None:
         for font in ("Helvetica, Arial, sans-serif", "DejaVu Sans"):
             file.write_text(source.replace("Helvetica, Arial, sans-serif", font), encoding="utf-8")
             page.goto(file.as_uri())
-            check(page.evaluate(BOXES))
+            boxes = page.evaluate(BOXES)
+            assert len(boxes) > 10
+            for text, left, top, right, bottom in boxes:
+                assert left >= 0 and right <= 1040 and top >= 0 and bottom <= 500, f"{text!r} leaves the drawing"
+            for (a, *one), (b, *other) in combinations(boxes, 2):
+                beside = one[2] <= other[0] or other[2] <= one[0]
+                apart = one[3] - LEADING <= other[1] + LEADING or other[3] - LEADING <= one[1] + LEADING
+                assert beside or apart, f"{a!r} overlaps {b!r}"
 
 
-def check(boxes: list[Any]) -> None:
-    assert len(boxes) > 10
-    for text, left, top, right, bottom in boxes:
-        assert left >= 0 and right <= 1040 and top >= 0 and bottom <= 500, f"{text!r} leaves the drawing"
-    for (a, *one), (b, *other) in combinations(boxes, 2):
-        beside = one[2] <= other[0] or other[2] <= one[0]
-        apart = one[3] - LEADING <= other[1] + LEADING or other[3] - LEADING <= one[1] + LEADING
-        assert beside or apart, f"{a!r} overlaps {b!r}"
-
-
-SOURCE = ROOT / "src" / "robotdiffuse"
-PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-FILES = sorted(set(re.findall(r"`([\w/]+\.py)`", PAGE)))
-
-
-def test_every_named_file_exists() -> None:
+def test_every_named_file_exists_and_every_package_is_described() -> None:
     """A row of the page names a folder once; further files of the row have shorter paths."""
-    missing = [name for name in FILES if not (ROOT / name).is_file() and not any(SOURCE.rglob(name))]
+    source = ROOT / "src" / "robotdiffuse"
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    files = re.findall(r"`([\w/]+\.py)`", page)
+    missing = [name for name in files if not (ROOT / name).is_file() and not any(source.rglob(name))]
     assert not missing, f"docs/architecture.md names {missing}"
-
-
-def test_every_package_is_described() -> None:
-    packages = {folder.name for folder in SOURCE.iterdir() if (folder / "__init__.py").is_file()}
-    described = set(re.findall(r"^\| `(\w+)` \|", PAGE, re.MULTILINE))
+    packages = {folder.name for folder in source.iterdir() if (folder / "__init__.py").is_file()}
+    described = set(re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE))
     assert packages <= described, f"docs/architecture.md lacks {', '.join(sorted(packages - described))}"

@@ -95,8 +95,7 @@ def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path, 
 
 def test_a_planner_of_the_program_itself_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PLANNERS, "mine", Entry("__main__:Mine", "for tests"))
-    with pytest.raises(rd.InputError, match="planner mine is in the program that was started"):
-        bench.run_bench(settings(tmp_path, "mine", count=1), quiet, quiet)
+    refuses("planner mine is in the program that was started", bench.run_bench, settings(tmp_path, "mine"), quiet, quiet)
 
 
 def test_a_metric_of_an_imported_module_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -346,10 +345,11 @@ def test_a_preset_in_place_of_planners_and_limits(tmp_path: Path, said: Said) ->
     assert "--preset cannot be combined with --planners" in said(2, *asked, "--preset", "anytime")
 
 
-@pytest.fixture
-def with_records(tmp_path: Path) -> Path:
+@pytest.mark.sim
+def test_motions_are_looked_at_again(tmp_path: Path, said: Said) -> None:
+    """Where there are results, and problems for them."""
     pytest.importorskip("pybullet", reason="the extra `sim` (pybullet) is not installed")
-    case = gather_cases(["rop_nontrivial"], 1, tmp_path, lambda _: None)[0]
+    case = gather_cases(["rop_nontrivial"], 1, tmp_path, quiet)[0]
     problem = case.problem
     path = RRTConnect().plan(problem, 10.0).path
     assert isinstance(problem.goal, rd.JointGoal)
@@ -361,21 +361,12 @@ def with_records(tmp_path: Path) -> Path:
         replace(about, planner="none", status="timeout"),
     ):
         RecordFile(record_path(tmp_path, record.planner)).append(record)
-    return tmp_path
-
-
-@pytest.mark.sim
-def test_motions_are_looked_at_again(with_records: Path, said: Said) -> None:
-    lines = said(1, "bench", "confirm", with_records).splitlines()
+    lines = said(1, "bench", "confirm", tmp_path).splitlines()
     rows = {line.split()[0]: line.split()[1:] for line in lines[1:4]}
     assert rows == {"bad": ["1", "1"], "good": ["1", "0"], "none": ["0", "0"]}
     assert lines[4].startswith("bad, rop_nontrivial rop/") and "mm deep" in lines[4]
-    (with_records / "records" / "bad.jsonl").unlink()
-    said(0, "bench", "confirm", with_records, "--count", 1)
-
-
-@pytest.mark.sim
-def test_folder_without_results_or_problems(with_records: Path, said: Said) -> None:
-    assert "holds no records" in said(2, "bench", "confirm", with_records / "nothing")
-    (with_records / "problems" / "rop.jsonl").unlink()
-    assert "of rop_nontrivial, which has results" in said(2, "bench", "confirm", with_records, "--count", 1)
+    (tmp_path / "records" / "bad.jsonl").unlink()
+    said(0, "bench", "confirm", tmp_path, "--count", 1)
+    assert "holds no records" in said(2, "bench", "confirm", tmp_path / "nothing")
+    (tmp_path / "problems" / "rop.jsonl").unlink()
+    assert "of rop_nontrivial, which has results" in said(2, "bench", "confirm", tmp_path, "--count", 1)

@@ -294,7 +294,7 @@ def test_a_metric_is_declared_in_one_place(small, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_command_writes_everything(small, tmp_path, said: Said):
+def test_the_command_writes_everything_also_to_a_folder_that_does_not_exist(small, tmp_path, said: Said):
     pytest.importorskip("matplotlib")
     keep_problems(small, ["rop/0", "rop/1"])
     out = tmp_path / "out"
@@ -305,21 +305,15 @@ def test_the_command_writes_everything(small, tmp_path, said: Said):
     for name in ("robotdiffuse", "mpnet", "ompl_rrt_star"):
         assert page.count(f">{name}<") >= 4, name
     assert "http" not in re.sub(r'xmlns(:\w+)?="[^"]*"|<metadata>.*?</metadata>', "", page, flags=re.DOTALL)
-    names = re.findall(r'\bid="([^"]*)"', page)
-    assert len(names) == len(set(names)) and not (out / "replays.html").exists()
+    ids = re.findall(r'\bid="([^"]*)"', page)
+    assert len(ids) == len(set(ids)) and not (out / "replays.html").exists()
     plots = re.findall(r"!\[.*?\]\((.*?)\)", (out / "report.md").read_text())
     assert {"success_rop.svg", "length_rop_non_trivial.svg"} < set(plots)
     for name in plots:
         assert ElementTree.parse(out / name).getroot().tag.endswith("svg")
-
-
-@pytest.mark.slow
-def test_a_folder_that_does_not_exist_is_made_for_replays_too(small: Path, tmp_path: Path, said: Said) -> None:
-    pytest.importorskip("matplotlib")
-    keep_problems(small, ["rop/0"])
     said(0, "bench", "report", small, "--out", tmp_path / "new" / "report")
-    names = {file.name for file in (tmp_path / "new" / "report").iterdir()}
-    assert {"index.html", "replays.html", "report.md"} < names
+    written = {file.name for file in (tmp_path / "new" / "report").iterdir()}
+    assert {"index.html", "replays.html", "report.md"} < written
 
 
 def test_no_legend_or_name_is_clipped() -> None:

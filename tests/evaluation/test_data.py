@@ -51,7 +51,7 @@ def test_what_is_right_passes(tmp_path, pybullet):
 def test_collision_is_found_by_both_validators(tmp_path, pybullet):
     write_motions(tmp_path, ARM, [*right(3), record(ARM, BALL, line(AWAY, BACK))], shard=3)
     check = check_data(tmp_path, ARM)
-    assert {kind: n for kind, n in check.counts.items() if n} == {"collision": 1, "pybullet": 1}
+    assert {kind: n for kind, n in check.counts.items() if n} == COLLISION
     for example in check.findings:
         assert example.where == "shard 1, row 0"
         assert "sphere" in example.message and "inside" in example.message
@@ -226,7 +226,7 @@ def test_large_sets_are_sampled_evenly(tmp_path, rows, monkeypatch):
     assert np.array_equal(kept[:, [0, -1]], [row["trajectories"][[0, -1]] for row in chosen])
 
 
-def test_page(tmp_path, rows):
+def test_a_page_is_complete_the_same_again_and_not_of_another_robot(tmp_path, rows):
     data = tmp_path / "arm <1>"
     file = tmp_path / "report.html"
     write_motions(data, ARM, rows)
@@ -242,6 +242,10 @@ def test_page(tmp_path, rows):
     before = file.read_bytes()
     data_report.write_page(data, file, ARM)
     assert file.read_bytes() == before
+    write_motions(data, ARM, rows[:1])
+    data_report.write_page(data, file, ARM)  # of hardly any motions
+    refuses("unknown ending", data_report.write_page, data, tmp_path / "a.pdf", ARM)
+    refuses("fingerprint", data_report.write_page, data, file, rd.load_robot("panda"))
 
 
 def test_ticks_of_histograms_say_where_they_are() -> None:
@@ -250,14 +254,3 @@ def test_ticks_of_histograms_say_where_they_are() -> None:
     svg = histograms({"length": (np.arange(8.0), {"a": np.arange(7.0)})}, across=1)
     ticks = [float(text) for text in re.findall(r">([\d.]+)%<", svg)]
     assert np.allclose(np.diff(ticks), 2.5), "the example has ticks between whole percents"
-
-
-def test_page_of_hardly_any_motions(tmp_path, rows):
-    write_motions(tmp_path, ARM, rows[:1])
-    data_report.write_page(tmp_path, tmp_path / "report.html", ARM)
-
-
-def test_other_robots_and_endings_are_refused(tmp_path, rows):
-    write_motions(tmp_path, ARM, rows)
-    for file, robot, message in (("a.pdf", ARM, "unknown ending"), ("a.html", rd.load_robot("panda"), "fingerprint")):
-        refuses(message, data_report.write_page, tmp_path, tmp_path / file, robot)

@@ -47,13 +47,6 @@ def test_the_papers_method_has_a_row_only_with_weights_that_see_the_code_alone(t
     assert not {*"*`"} & {*paper.NO_WEIGHTS}, "notes are plain text"
 
 
-def test_workers_and_a_cluster_are_refused_together(tmp_path: Path, said: Said) -> None:
-    for part in ("table1", "figures"):
-        options = ("--out", tmp_path / "out", "--workers", "2", "--cluster", "ray")
-        assert "--workers cannot be combined with --cluster" in said(2, "reproduce", part, *options)
-    assert not (tmp_path / "out").exists()
-
-
 def test_the_commands_of_pages_name_data_weights_and_family(tmp_path: Path) -> None:
     of_figures = paper.Table1Settings(tmp_path, problems=3, paper_weights="paper", data="rop").command("figures")
     assert of_figures.endswith(" figures --out FOLDER --problems 3 --time-limit 10 --paper-weights FOLDER --data DATA")
@@ -152,6 +145,10 @@ def test_bad_input(tmp_path: Path, said: Said) -> None:
     assert "known: " in said(2, *base, "--rows", "Ourz")
     assert "known: cabinet, clutter, crate" in said(2, *base, "--family", "ropp")
     assert "no data set" in said(2, *base)
+    for part in ("table1", "figures"):
+        options = ("--out", tmp_path / "out", "--workers", "2", "--cluster", "ray")
+        assert "--workers cannot be combined with --cluster" in said(2, "reproduce", part, *options)
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_mean_of_two_trainings_leaves_unsolved_problems_out() -> None:

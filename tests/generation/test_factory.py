@@ -5,10 +5,10 @@ import multiprocessing
 import os
 import random
 import re
-import resource
 import shutil
 import signal
 import time
+from contextlib import ExitStack
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -20,6 +20,7 @@ from numpy import ndarray
 
 import robotdiffuse as rd
 from helpers import factory_runs
+from helpers.full_disk import full_disk
 from helpers.refusals import refuses
 from helpers.sphere_oracles import least_clearance
 from robotdiffuse.collision import CollisionChecker
@@ -304,11 +305,7 @@ def test_goals_a_turn_away_are_taken_the_short_way() -> None:
     pytest.fail(f"only {len(far)} such problems")
 
 
-TRAJECTORIES = 30
-SHARD = 3
-WAYPOINTS = 16
-SHARDS = TRAJECTORIES // SHARD
-MANY = GenerationSettings(trajectories=TRAJECTORIES, shard=SHARD, waypoints=WAYPOINTS)
+MANY = GenerationSettings(trajectories=30, shard=3, waypoints=16)
 
 
 @pytest.fixture(scope="module")
@@ -317,24 +314,24 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(factory, "on_this_machine", factory_runs.in_this_process)
         generate(MANY, out)
-    assert factory_runs.shards(out) == SHARDS
+    assert factory_runs.shards(out) == MANY.shards
     return factory_runs.contents(out)
 
 
 @pytest.mark.slow
 def test_killed_at_a_random_moment_it_ends_in_the_same_data(undisturbed, tmp_path):
-    run = factory_runs.start(tmp_path, TRAJECTORIES, SHARD, WAYPOINTS, 2)
+    run = factory_runs.start(tmp_path, MANY, 2)
     factory_runs.wait_for_shards(run, tmp_path, 1)
     time.sleep(random.uniform(0, 0.1))
     assert len(factory_runs.members(run.pid)) >= 2, "the command and a worker; the other may be at its start or end"
     run.kill()
     run.communicate(timeout=500)
-    assert run.returncode == -signal.SIGKILL and factory_runs.shards(tmp_path) < SHARDS
+    assert run.returncode == -signal.SIGKILL and factory_runs.shards(tmp_path) < MANY.shards
     assert factory_runs.group_ends(run.pid), "workers outlive the command"
-    run = factory_runs.start(tmp_path, TRAJECTORIES, SHARD, WAYPOINTS, 2)
+    run = factory_runs.start(tmp_path, MANY, 2)
     said, complaints = run.communicate(timeout=400)
-    assert run.returncode == 0 and re.fullmatch(rf"trajectories: \d+ of {TRAJECTORIES}\n", complaints)
-    assert said == f"{TRAJECTORIES} trajectories of {WAYPOINTS} waypoints in {tmp_path}\n"
+    assert run.returncode == 0 and re.fullmatch(r"trajectories: \d+ of 30\n", complaints)
+    assert said == f"30 trajectories of 16 waypoints in {tmp_path}\n"
     assert factory_runs.contents(tmp_path) == undisturbed
     assert factory_runs.group_ends(run.pid)
 
@@ -343,7 +340,7 @@ def test_killed_at_a_random_moment_it_ends_in_the_same_data(undisturbed, tmp_pat
 @pytest.mark.parametrize("count", [0, 1])
 def test_ctrl_c_stops_all_in_one_line(count: int, tmp_path: Path) -> None:
     """Ctrl-C reaches all processes, as in a terminal: while the workers start, and while they work."""
-    run = factory_runs.start(tmp_path, TRAJECTORIES, SHARD, WAYPOINTS, 2)
+    run = factory_runs.start(tmp_path, MANY, 2)
     while len(factory_runs.members(run.pid)) < 3:
         assert run.poll() is None
         time.sleep(0.02)
@@ -351,8 +348,8 @@ def test_ctrl_c_stops_all_in_one_line(count: int, tmp_path: Path) -> None:
     os.killpg(run.pid, signal.SIGINT)
     said, complaints = run.communicate(timeout=500)
     assert (run.returncode, said) == (130, "")
-    assert re.fullmatch(rf"(trajectories: 0 of {TRAJECTORIES}\n)?robotdiffuse: stopped\n", complaints)
-    assert factory_runs.group_ends(run.pid) and factory_runs.shards(tmp_path) < SHARDS
+    assert re.fullmatch(r"(trajectories: 0 of 30\n)?robotdiffuse: stopped\n", complaints)
+    assert factory_runs.group_ends(run.pid) and factory_runs.shards(tmp_path) < MANY.shards
     assert not [name for name in factory_runs.contents(tmp_path) if name.startswith(".")]
 
 
@@ -360,21 +357,18 @@ def test_ctrl_c_stops_all_in_one_line(count: int, tmp_path: Path) -> None:
 def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(undisturbed, tmp_path, monkeypatch):
     """Files cannot grow beyond a kilobyte, so that writing any file fails as on a full disk."""
     monkeypatch.setattr(factory, "on_this_machine", factory_runs.in_this_process)
-    most = resource.getrlimit(resource.RLIMIT_FSIZE)
 
     def fill_up(done: int, _total: int) -> None:
-        if done == 2 * SHARD:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (1000, most[1]))
+        if done == 2 * MANY.shard:
+            filled.enter_context(full_disk(1000))
 
-    try:
+    with ExitStack() as filled:
         with pytest.raises(OutputError, match=r"shard_00002\.zarr cannot be written: File too large$"):
             generate(MANY, tmp_path, progress=fill_up)
         assert factory_runs.shards(tmp_path) == 2 and len(list(tmp_path.iterdir())) == 3
         with pytest.raises(OutputError, match=r"manifest\.json.*: File too large$"):
             generate(MANY, tmp_path / "other")
         assert not (tmp_path / "other").exists()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, most)
     generate(MANY, tmp_path)
     assert factory_runs.contents(tmp_path) == undisturbed
 
@@ -384,11 +378,11 @@ def test_a_worker_killed_from_outside_is_one_line_and_the_next_call_goes_on(
     undisturbed: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def kill(done: int, _total: int) -> None:
-        if done == SHARD:
+        if done == MANY.shard:
             os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
 
     refuses(r"worker process was killed.*run the same command again$", generate, MANY, tmp_path, workers=2, progress=kill)
-    assert 0 < factory_runs.shards(tmp_path) < SHARDS
+    assert 0 < factory_runs.shards(tmp_path) < MANY.shards
     monkeypatch.setattr(factory, "on_this_machine", factory_runs.in_this_process)
     generate(MANY, tmp_path)
     assert factory_runs.contents(tmp_path) == undisturbed

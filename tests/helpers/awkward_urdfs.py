@@ -118,10 +118,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "a missing mesh of a long name": (arm(ARM, ending(f"{'long_' * 30}name.stl")), "long_name.stl' does not exist; add it"),
     "a folder": (lambda folder: folder, "cannot be read: it is a folder"),
     "an axis of zero length": (arm(chain("base", row("j", 3), axis="0 0 0")), "its axis is zero"),
-    "limits that are no numbers": (
-        arm(chain("base", ["j"], limits='lower="nan" upper="1"')),
-        "is 'nan'",
-    ),
+    "limits that are no numbers": (arm(chain("base", ["j"], limits='lower="nan" upper="1"')), "is 'nan'"),
     "a triangle": (solid(trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])), "has no triangle mesh"),
     "a mesh with corners that are no numbers": (
         solid(b"v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 2 3 4\n", "part.obj"),

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from helpers.waiting import until
+from robotdiffuse.generation import GenerationSettings
 from robotdiffuse.processes.workers import Results
 
 HEARS_CTRL_C = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
@@ -29,9 +30,9 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(file.relative_to(folder)): file.read_bytes() for file in files}
 
 
-def start(out: Path, trajectories: int, shard: int, waypoints: int, workers: int) -> subprocess.Popen[str]:
+def start(out: Path, settings: GenerationSettings, workers: int) -> subprocess.Popen[str]:
     """Starts the command in a process group of its own."""
-    sizes = {"trajectories": trajectories, "shard": shard, "waypoints": waypoints, "workers": workers}
+    sizes = {name: getattr(settings, name) for name in ("trajectories", "shard", "waypoints")} | {"workers": workers}
     options = [text for name, value in sizes.items() for text in (f"--{name}", str(value))]
     return subprocess.Popen(
         [*COMMAND, "data", "generate", "--out", str(out), *options],

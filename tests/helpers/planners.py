@@ -62,10 +62,6 @@ class Deadly(RRTConnect):
         return super().solve(context, start_goal)
 
 
-MAX_WAIT = 300.0
-"""Longest wait for `go` [s]."""
-
-
 class SlowPlanner(AORRTC):
     """AORRTC that waits for `go` before it returns, and raises an error if an obstacle is named broken."""
 
@@ -82,5 +78,5 @@ class SlowPlanner(AORRTC):
             raise RuntimeError("no such luck")
         result = super().plan(problem, 60.0)
         self.calls.append(problem)
-        assert self.go.acquire(timeout=MAX_WAIT)
+        assert self.go.acquire(timeout=300.0)
         return result

@@ -5,15 +5,15 @@ from collections.abc import Callable
 from typing import Any
 
 
-def until(holds: Callable[[], object], patience: float, about: Callable[[], object] = lambda: "") -> None:
-    """Waits until `holds()`, for at most `patience` [s]; the message of a failure is `about()`."""
+def until(holds: Callable[[], object], patience: float = 300.0, about: Callable[[], object] = lambda: "") -> None:
+    """Waits until `holds()`, for at most `patience` [s], for a new machine compiles; the message of a failure is `about()`."""
     end = time.monotonic() + patience
     while not holds():
         assert time.monotonic() < end, about()
         time.sleep(0.005)
 
 
-def state_when(session: Any, holds: Callable[[Any], object], patience: float) -> Any:
+def state_when(session: Any, holds: Callable[[Any], object], patience: float = 300.0) -> Any:
     """Waits until the state of a page's session satisfies `holds`; returns the state."""
     until(lambda: holds(session.state), patience, lambda: session.state)
     return session.state

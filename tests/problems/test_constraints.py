@@ -124,7 +124,7 @@ def test_constraints_move_with_the_world_and_survive_files(constraint: Constrain
         np.testing.assert_allclose(PathConstraints(again).values(q), values, atol=1e-9)
 
 
-def test_bad_input_is_refused_by_one_line() -> None:
+def test_bad_input_is_refused_by_one_line_that_names_the_field() -> None:
     refuses("axis_cone.axis is 'up'", rd.AxisCone, HAND, "up", [0, 0, 1], 0.1)
     refuses("axis_cone.angle is 0; .* 0.001 to 3.14159", rd.AxisCone, HAND, [0, 0, 1], [0, 0, 1], 0)
     refuses("on_line.tolerance is '1 mm'", rd.OnLine, HAND, [0, 0, 0], [0, 0, 1], "1 mm")
@@ -138,9 +138,6 @@ def test_bad_input_is_refused_by_one_line() -> None:
     refuses("2 goal configurations .* differ", PathConstraints, replace(line, goal=[START, GOAL]))  # type: ignore[arg-type]
     loose = replace(line, goal=rd.PoseGoal(HAND, PANDA.fk(GOAL, HAND), [0.1, 0, 0]))
     refuses("the goal must determine the pose of this link, but the goal has tolerances", PathConstraints, loose)
-
-
-def test_files_name_the_field() -> None:
     for entry, message in (
         ({"upright": {}}, r"unknown field of constraints\[0\]: 'upright'; known: axis_cone, cartesian"),
         ({"axis_cone": {"frame": HAND}}, r"constraints\[0\].axis_cone has no axis and no direction"),

@@ -25,6 +25,7 @@ END = [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
 POST = rd.Cylinder([0.5, 0.0, 0.3], 0.04, 0.6, name="post")
 TABLE = {"box": {"center": [0.55, 0, 0.1], "size": [0.5, 1.0, 0.2], "wxyz": [0.9, 0, 0, 0.2], "name": "table"}}
 AHEAD = transform(np.array([0.5, 0.0, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
+WIDE = rd.PoseGoal("panda_hand", AHEAD, [0.0, 0.35, 0.0], [0.0, 0.0, np.pi])
 DOWN = transform(np.array([0.45, 0.3, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
 
 
@@ -60,8 +61,7 @@ def test_tolerances_are_along_the_axes_of_the_goal() -> None:
 def test_a_box_of_positions_is_reached_where_its_middle_is_blocked() -> None:
     blocked = rd.Problem(ROBOT, rd.Scene([POST]), START, rd.PoseGoal("panda_hand", AHEAD))
     assert rd.plan(blocked).status is rd.Status.INVALID_GOAL
-    wide = rd.PoseGoal("panda_hand", AHEAD, [0.0, 0.35, 0.0], [0.0, 0.0, np.pi])
-    result = rd.plan(rd.Problem(ROBOT, rd.Scene([POST]), START, wide), time_limit=10.0)
+    result = rd.plan(rd.Problem(ROBOT, rd.Scene([POST]), START, WIDE), time_limit=10.0)
     assert result.path is not None, result.reason
     T = inverse(AHEAD) @ ROBOT.fk(result.path.positions[-1], "panda_hand")
     assert np.abs(T[[0, 2], 3]).max() < 1e-5 and abs(T[1, 3]) < 0.35
@@ -71,8 +71,7 @@ def test_a_box_of_positions_is_reached_where_its_middle_is_blocked() -> None:
 def test_a_box_of_positions_is_reached_where_only_its_middle_is_free() -> None:
     """Projections end at the edges of the tolerances, which are blocked by obstacles here."""
     blocks = [rd.Box([0.5, side * 0.42, 0.35], [0.6, 0.4, 0.7]) for side in (-1, 1)]
-    wide = rd.PoseGoal("panda_hand", AHEAD, [0.0, 0.35, 0.0], [0.0, 0.0, np.pi])
-    result = rd.plan(rd.Problem(ROBOT, rd.Scene(blocks), MIDDLE, wide), time_limit=10.0)
+    result = rd.plan(rd.Problem(ROBOT, rd.Scene(blocks), MIDDLE, WIDE), time_limit=10.0)
     assert result.path is not None, result.reason
     assert abs(ROBOT.fk(result.path.positions[-1], "panda_hand")[1, 3]) < 0.2
 

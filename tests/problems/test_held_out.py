@@ -75,13 +75,10 @@ def test_line_that_was_cut_off_is_made_again(tmp_path: Path) -> None:
     assert len(referee.validated) == 4
 
 
-def test_damaged_lines_are_named(tmp_path: Path) -> None:
+def test_damaged_lines_are_named_and_two_of_one_name_refused(tmp_path: Path) -> None:
     file = tmp_path / "rop.jsonl"
     for line, message in (("[1, 2]", "line 1 is not a JSON object"), ('{"drawn": 3}', "line 1 has drawn")):
         file.write_text(line + "\n")
         refuses(message, CaseFile, file)
-
-
-def test_two_of_one_name_are_refused() -> None:
     case = Case("a", "mine", held_out_problem("rop", 0), False)
     refuses("two problems are called a", CaseFile(None).fill, [case, case])

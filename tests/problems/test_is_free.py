@@ -23,15 +23,12 @@ def test_a_free_configuration_is_true_without_a_reason() -> None:
         assert state and state.reason == "" and state.links == ()
 
 
-def test_the_reason_names_link_and_obstacle_or_links_that_touch_each_other() -> None:
+def test_the_reason_names_links_and_obstacle_or_the_limit_and_a_wrong_shape_is_an_error() -> None:
     state = PROBLEM.is_free(Q)
     assert not state and state.reason.startswith("panda_hand is ") and state.reason.endswith("inside ball")
     assert state.links[0] == "panda_hand"
     state = rd.Problem(PANDA, rd.Scene(), Q, Q).is_free([0, 0, 0, -3.0, 0, 0, 0])
     assert not state and "overlap" in state.reason and len(state.links) >= 2
-
-
-def test_out_of_limits_is_a_reason_and_a_wrong_shape_an_error() -> None:
     assert PROBLEM.is_free([9.0, *Q[1:]]).reason.startswith("panda_joint1 is 9 rad; its limits are")
     refuses("q has 2 values", PROBLEM.is_free, [1, 2])
     refuses("unknown pose in q: 'home'; known: extended, ready", PROBLEM.is_free, "home")

@@ -136,13 +136,9 @@ def test_a_tool_is_the_tip_and_its_shapes_are_in_the_frame_of_its_link() -> None
     assert "tool" not in PANDA.with_tool("panda_hand", T_hand_tool).spheres, "a mere frame"
 
 
-def test_a_second_object_of_one_name_is_called_no_link() -> None:
-    part = rd.Box([0.0, 0.0, 0.2], [0.04, 0.04, 0.1], name="part")
-    held = PANDA.attach(part, "panda_hand")
-    refuses("'part', a link or held object of panda; give it another", held.attach, part, "panda_hand")
-
-
-def test_what_cannot_be_held_is_refused_in_one_line() -> None:
+def test_what_cannot_be_held_is_refused_in_one_line_that_calls_no_held_object_a_link() -> None:
+    held = PANDA.attach(SHAPES[2], "panda_hand")
+    refuses("'cup', a link or held object of panda; give it another", held.attach, SHAPES[2], "panda_hand")
     refuses("unknown link in attached.link: 'hand'; known: l1, l2, l3", box_arm().attach, SHAPES[0], "hand")
     refuses("no planned joint moves .*; moved links: l1", box_arm().attach, SHAPES[0], box_arm().base)
     refuses("'l2', a link or held object of", box_arm().attach, rd.Sphere([0, 0, 0], 0.1, name="l2"), "l3")

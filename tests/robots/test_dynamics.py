@@ -105,7 +105,7 @@ def test_what_cannot_be_held_is_told() -> None:
 GOOD: dict[str, Any] = {"robot": "panda", "scene": [], "start": LOW, "goal": {"joints": FAR}}
 
 
-def test_wrong_payloads_are_one_line() -> None:
+def test_wrong_payloads_and_robots_without_inertias_are_one_line() -> None:
     for data, message in (
         ({"mass": -1}, "payload.mass is -1; it must be a number of kg from 0 to 10000"),
         ({"com": [0, 0, 0]}, "missing field of payload: mass|payload.*mass"),
@@ -113,9 +113,6 @@ def test_wrong_payloads_are_one_line() -> None:
         ({"mass": 1, "weight": 2}, "unknown field of payload: 'weight'"),
     ):
         refuses(message, problem_from_record, GOOD | {"payload": data})
-
-
-def test_robots_without_inertias_are_refused_by_name() -> None:
     arm = rd.load_robot("iiwa14")
     middle = (arm.lower + arm.upper) / 2
     told = "iiwa14 has no inertia of what moves with joint joint_a1"

@@ -106,18 +106,14 @@ def test_surface_is_shared_by_area_and_seeded() -> None:
     assert (points == sample_surface(scene, 5000, np.random.default_rng(3))).all()
 
 
-def test_surface_keeps_to_the_region() -> None:
+def test_surface_keeps_to_the_region_and_is_empty_where_nothing_is_visible() -> None:
+    """An empty scene, a shape out of reach, the floor alone, and an empty cloud have none."""
     region = VisibleRegion()
     floor = rd.Box([0, 0, -0.05], [2, 2, 0.1])
     points = sample_surface(rd.Scene([floor, rd.Box([1.5, 0, 0.4], [4.0, 4.0, 0.02])]), 512, np.random.default_rng(4))
     assert len(points) == 512 and (points[:, 2] > region.floor).all()
     assert (np.linalg.norm(points - region.center, axis=1) < region.reach).all()
-
-
-def test_surface_of_nothing_visible() -> None:
-    """An empty scene, a shape out of reach, the floor alone, and an empty cloud."""
-    alone = rd.Sphere([5, 0, 0.5], 0.2), rd.Box([0, 0, -0.05], [2, 2, 0.1]), rd.PointCloud([])
-    for shapes in ([], *([one] for one in alone)):
+    for shapes in ([], [rd.Sphere([5, 0, 0.5], 0.2)], [floor], [rd.PointCloud([])]):
         assert sample_surface(rd.Scene(shapes), 64, np.random.default_rng(5)).shape == (0, 3)
 
 

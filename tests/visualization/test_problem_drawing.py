@@ -8,11 +8,11 @@ import pytest
 import robotdiffuse as rd
 from helpers.pages import page_data
 from helpers.panda import GOAL, PANDA, START
+from robotdiffuse.core.transforms import transform
 from robotdiffuse.visualization.replay_page import COLLIDING, write_problem
 
 AT_START = rd.Sphere(PANDA.fk(START, "panda_hand")[:3, 3], 0.05, "ball")
-FAR = np.eye(4)
-FAR[0, 3] = 1.5
+FAR = transform(np.array([1.5, 0.0, 0.0]))
 
 
 def page(problem: rd.Problem, file: Path) -> dict:
@@ -37,8 +37,7 @@ def test_links_that_collide_are_red(tmp_path: Path) -> None:
 def test_a_goal_out_of_reach_has_axes(moved: bool, tmp_path: Path) -> None:
     problem = rd.Problem(PANDA, rd.Scene(), START, rd.PoseGoal("panda_hand", FAR))
     if moved:
-        T = np.eye(4)
-        T[:3, 3] = 1.0, 2.0, 0.5
+        T = transform(np.array([1.0, 2.0, 0.5]))
         problem = rd.Problem.in_world(T, PANDA, rd.Scene(), START, rd.PoseGoal("panda_hand", T @ FAR))
     data = page(problem, tmp_path / "a.html")
     assert data["positions"] == [START.tolist()] and len(data["scene"]) == 3

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("few_lights")
 SMALL = PictureSettings(width=320, height=200, ghosts=2)
 
 
-def test_replay_holds_everything(arm, scene, motion, tmp_path):
+def test_replay_holds_everything_and_loads_nothing(arm, scene, motion, tmp_path):
     path = Path(arm.joint_names, motion.positions)
     told = Status.SOLVED, "", "robotdiffuse", arm.name, 0.0123, 0, "refinement", path, motion
     result = PlanResult(*told, min_clearance=0.042)
@@ -35,22 +35,11 @@ def test_replay_holds_everything(arm, scene, motion, tmp_path):
     assert dict(data["facts"])["clearance"] == "42.0 mm"
     assert dict(data["facts"])["planner"] == "robotdiffuse · refinement"
     assert data["robot"]["spheres"] == [[3, 0.0, 0.0, 0.1, 0.12]] and file.stat().st_size < 800_000
-
-
-def test_replay_loads_nothing(arm, scene, motion, tmp_path):
-    file = tmp_path / "replay.html"
-    write_replay(arm, scene, motion, file)
-    text = file.read_text("utf-8")
     # The one address is the name of a namespace, which no browser opens.
     assert set(re.findall(r"https?://[^\s\"'`)]+", text)) <= {"http://www.w3.org/1999/xhtml"}
     for loading in (r"<link\b", r"\bsrc\s*=\s*[\"']", r"@import", r"url\((?!#)", r"\bimport\s*\("):
         assert not re.search(loading, text.split("<script>")[0]), loading
     assert not re.search(r"<script[^>]+src", text)
-
-
-def test_replay_geometry_decodes_to_the_meshes(arm, scene, motion, tmp_path):
-    write_replay(arm, scene, motion, tmp_path / "replay.html")
-    data = page_data(tmp_path / "replay.html")
     for surface, part in zip(DrawnArm(arm).surfaces, data["robot"]["frames"], strict=True):
         raw = np.frombuffer(base64.b64decode(part["vertices"]), "<u2").reshape(-1, 3)
         np.testing.assert_allclose(part["low"] + raw * part["step"], surface.vertices, atol=1e-5)

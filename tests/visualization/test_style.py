@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 import robotdiffuse as rd
 from helpers.three_bars import CORNERS, CUBE
@@ -19,8 +20,6 @@ def test_trace_follows_the_outer_end_of_the_tip(arm, motion):
 
 
 def test_creases_keep_edges_of_a_box_and_smooth_a_ball():
-    import trimesh
-
     box = creased(CORNERS, CUBE, np.ones((12, 3)))
     assert len(box.vertices) == 24 and np.sort(np.abs(box.normals), axis=1)[:, :2].max() < 1e-12
     ball = trimesh.creation.icosphere(subdivisions=3)

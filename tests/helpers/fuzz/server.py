@@ -341,19 +341,18 @@ class Server:
         if lines:
             raise WrongError(f"the server's log has {lines[-1]}")
         self.checks += 1
-        held = sum(_memory(pid) for pid in (self.process.pid, *_children(self.process.pid)))
+        held = _memory(self.process.pid)
         if self.checks <= SETTLING_CHECKS:
             self.held = held
         if held > self.held + MAX_MEMORY_GROWTH:
             raise WrongError(f"memory grew from {self.held >> 20} to {held >> 20} MB")
 
 
-def _children(pid: int) -> list[int]:
-    return [int(child) for child in FilePath(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-
-
 def _memory(pid: int) -> int:
-    return int(FilePath(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    """The memory of a process and its children [bytes]."""
+    children = FilePath(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    pages = [int(FilePath(f"/proc/{each}/statm").read_text().split()[1]) for each in (pid, *children)]
+    return sum(pages) * os.sysconf("SC_PAGE_SIZE")
 
 
 @cache

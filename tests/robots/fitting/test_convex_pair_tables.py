@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from trimesh.transformations import rotation_matrix
 
 from helpers.boxes import surface
 from helpers.quick_preparation import coarse_grids
@@ -37,12 +38,6 @@ def box(size: tuple[float, ...], at: tuple[float, ...]) -> Surface:
     return surface(trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)))
 
 
-def disc(radius: float, thickness: float) -> Surface:
-    """The surface of a disc whose axis is x."""
-    turned = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0])
-    return surface(trimesh.creation.cylinder(radius, thickness, transform=turned))
-
-
 def fork() -> tuple[Robot, dict[str, tuple[Surface, ...]]]:
     """A flange 3 mm from both prongs of a fork at any angle; bent far back, it hits the base of the fork."""
     y = np.array([0, 1.0, 0])
@@ -52,11 +47,12 @@ def fork() -> tuple[Robot, dict[str, tuple[Surface, ...]]]:
         Joint("bend", "revolute", "fork", "wrist", np.eye(4), y, -3.0, 3.0, *rates),
         Joint("spin", "continuous", "wrist", "flange", transform(np.array([0.09, 0, 0])), x, -9.0, 9.0, *rates),
     )
+    disc_along_x = trimesh.creation.cylinder(0.047, 0.14, transform=rotation_matrix(np.pi / 2, [0, 1, 0]))
     prongs = (box((0.4, 0.04, 0.1), (0, 0.07, 0)), box((0.4, 0.04, 0.1), (0, -0.07, 0)))
     surfaces = {
         "fork": (*prongs, box((0.05, 0.1, 0.1), (-0.175, 0, 0))),
         "wrist": (box((0.04, 0.04, 0.04), (0, 0, 0)),),
-        "flange": (disc(0.047, 0.14),),
+        "flange": (surface(disc_along_x),),
     }
     return Robot("fork", "fork", "flange", joints, meshes=dict.fromkeys(surfaces, ())), surfaces
 

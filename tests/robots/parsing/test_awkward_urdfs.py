@@ -17,10 +17,8 @@ from robotdiffuse.robots.fitting import preparation
 from robotdiffuse.robots.fitting.preparation import LARGE_REACH, PreparationSettings, add_robot
 from robotdiffuse.robots.parsing.urdf import UrdfTree
 
-PREPARED = (
-    *("a gantry", "names with slashes and spaces", "tiny links", "links without geometry"),
-    *("a mesh with degenerate triangles", "xacro"),
-)
+PREPARED = {"a gantry", "names with slashes and spaces", "tiny links", "links without geometry", "xacro"}
+PREPARED |= {"a mesh with degenerate triangles"}
 """Cases that the quick suite prepares; it reads the others, of which most differ for the reader alone."""
 
 

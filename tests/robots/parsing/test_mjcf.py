@@ -85,8 +85,9 @@ def state_of(model: Any, robot: rd.Robot, q: np.ndarray) -> Any:
     return data
 
 
-def test_frames_are_those_of_mujoco(file: Path) -> None:
-    robot = UrdfTree(file, {}).robot(tip="wrist")
+def test_frames_limits_poses_and_mimics_are_those_of_mujoco(file: Path) -> None:
+    tree = UrdfTree(file, {})
+    robot = tree.robot(tip="wrist", srdf=tree.semantics)
     model = mujoco.MjModel.from_xml_path(str(file))
     assert robot.joint_names == ("j1", "lift", "j2", "j3")
     for q in np.random.default_rng(0).uniform(robot.lower, robot.upper, (50, robot.dof)):
@@ -98,11 +99,6 @@ def test_frames_are_those_of_mujoco(file: Path) -> None:
             T = robot.fk(q, name)
             np.testing.assert_allclose(T[:3, 3], position, atol=1e-9)
             np.testing.assert_allclose(T[:3, :3], rotation.reshape(3, 3), atol=1e-9)
-
-
-def test_limits_poses_and_mimics_are_those_of_the_model(file: Path) -> None:
-    tree = UrdfTree(file, {})
-    robot = tree.robot(tip="wrist", srdf=tree.semantics)
     np.testing.assert_allclose([robot.lower[1], robot.upper[1]], [-0.1, 0.2])
     j2 = next(joint for joint in robot.joints if joint.name == "j2")
     assert j2.effort == 20

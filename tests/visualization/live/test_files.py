@@ -5,21 +5,16 @@ import json
 import pytest
 
 from helpers.refusals import refuses
-from robotdiffuse import Problem, load_robot
+from robotdiffuse import load_robot
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.visualization.live.session import first_problem, problem_for, problem_text, uploaded_problem
 
-
-@pytest.fixture(scope="module")
-def demo() -> Problem:
-    return first_problem(None, None)
+DEMO = first_problem(None, None)
 
 
-def test_problems_go_out_and_come_back(demo: Problem) -> None:
-    back = uploaded_problem(problem_text(demo), "problem.yaml", demo.robot)
-    assert problem_record(back) == problem_record(demo)
-    text = json.dumps(problem_record(demo)).encode()
-    assert problem_record(uploaded_problem(text, "problem.json", demo.robot)) == problem_record(demo)
+def test_problems_go_out_and_come_back() -> None:
+    for text, name in ((problem_text(DEMO), "p.yaml"), (json.dumps(problem_record(DEMO)).encode(), "p.json")):
+        assert problem_record(uploaded_problem(text, name, DEMO.robot)) == problem_record(DEMO), name
 
 
 @pytest.mark.parametrize("name", ["panda", "so101", "ur10"])
@@ -54,11 +49,11 @@ goal: {joints: [1, 0, 0, -1.5, 0, 1.5, 0]}
         ("", "problem is None"),
     ],
 )
-def test_what_is_wrong_with_an_uploaded_problem_is_one_line(text: str, wrong: str, demo: Problem) -> None:
-    assert refuses(wrong, uploaded_problem, text.encode(), "p.yaml", demo.robot).startswith("p.yaml")
+def test_what_is_wrong_with_an_uploaded_problem_is_one_line(text: str, wrong: str) -> None:
+    assert refuses(wrong, uploaded_problem, text.encode(), "p.yaml", DEMO.robot).startswith("p.yaml")
 
 
-def test_a_problem_and_a_robot_at_once_and_uploads_that_are_no_text_or_too_long(demo: Problem) -> None:
-    refuses(r"p\.yaml is not UTF-8 text", uploaded_problem, b"\xff\xfe", "p.yaml", demo.robot)
-    refuses("at most 5000000 are read", uploaded_problem, b" " * 5_000_001, "p.yaml", demo.robot)
+def test_a_problem_and_a_robot_at_once_and_uploads_that_are_no_text_or_too_long() -> None:
+    refuses(r"p\.yaml is not UTF-8 text", uploaded_problem, b"\xff\xfe", "p.yaml", DEMO.robot)
+    refuses("at most 5000000 are read", uploaded_problem, b" " * 5_000_001, "p.yaml", DEMO.robot)
     refuses(r"p\.yaml names its robot; give a problem or --robot ur5, not both", first_problem, "p.yaml", "ur5")

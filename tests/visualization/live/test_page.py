@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +9,8 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from helpers import waiting
-from helpers.browsers import MARKS, PATIENCE, opened
+from helpers.browsers import MARKS, opened
+from helpers.waiting import until
 from robotdiffuse.core.transforms import rotation_from_quaternion, transform
 from robotdiffuse.visualization.live import session as live
 
@@ -22,7 +21,6 @@ from robotdiffuse.visualization.live.server import PageServer, free_port
 
 VALID = "[data-validity=valid]"
 INVALID = "[data-validity=invalid]"
-until = partial(waiting.until, patience=PATIENCE)
 pytestmark = MARKS
 
 

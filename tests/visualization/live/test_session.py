@@ -4,15 +4,14 @@ import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 
 import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from helpers import waiting
 from helpers.planners import SlowPlanner
 from helpers.refusals import refuses
+from helpers.waiting import state_when, until
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.drawables import own_frame
@@ -21,9 +20,6 @@ from robotdiffuse.visualization.live import session as live
 
 START = np.array([0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8])
 END = np.array([1.2, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8])
-PATIENCE = 300.0
-"""Timeout [s]; a new machine compiles first."""
-until = partial(waiting.state_when, patience=PATIENCE)
 
 
 def settled(state: live.State) -> bool:
@@ -44,7 +40,7 @@ def started(planner: str, name: str = "lamp") -> Iterator[live.Session]:
 @pytest.fixture
 def session() -> Iterator[live.Session]:
     with started("aorrtc") as session:
-        until(session, settled)
+        state_when(session, settled)
         yield session
 
 
@@ -60,13 +56,13 @@ def test_the_badge_turns_red_at_once_and_green_with_the_new_plan(session: live.S
     q = first.trajectory.positions[len(first.trajectory.times) // 2]
     hand = transform(state.problem.robot.fk(q, "panda_hand")[:3, 3])
     session.change_obstacle("lamp", lambda shape: live.moved_to(shape, hand))
-    state = until(session, settled)
+    state = state_when(session, settled)
     assert state.motion is first and state.answer is None
     shown = live.validity(state)
     assert re.fullmatch(r"collides: panda_\w+ is \d+\.\d [cm]m inside lamp", shown.headline)
     assert re.fullmatch(r"at \d\.\d\d s of \d\.\d\d s", shown.lines[0])
     session.set_options(follow=True)
-    state = until(session, lambda state: settled(state) and state.motion is not first)
+    state = state_when(session, lambda state: settled(state) and state.motion is not first)
     assert live.validity(state).kind == live.VALID
     assert state.motion is not None and state.motion.trajectory is not None
     assert rd.verify(state.problem, state.motion.trajectory).valid
@@ -75,7 +71,7 @@ def test_the_badge_turns_red_at_once_and_green_with_the_new_plan(session: live.S
 def test_why_there_is_no_plan(session: live.Session) -> None:
     hand = session.state.problem.robot.fk(END, "panda_hand")
     session.change_obstacle("lamp", lambda shape: live.moved_to(shape, transform(hand[:3, 3])))
-    state = until(session, settled)
+    state = state_when(session, settled)
     assert state.answer is not None and state.answer.status is rd.Status.INVALID_GOAL
     shown = live.validity(state)
     assert shown.kind == live.INVALID
@@ -93,7 +89,7 @@ def test_the_target_is_dragged(session: live.Session) -> None:
         q = state.goal_configuration
         return q is not None and np.allclose(state.problem.robot.fk(q, state.goal_frame), T, atol=1e-5)
 
-    state = until(session, lambda state: settled(state) and stands(state))
+    state = state_when(session, lambda state: settled(state) and stands(state))
     assert state.answer is not None and state.answer.solved and live.validity(state).kind == live.VALID
 
 
@@ -102,10 +98,10 @@ def test_the_start_is_dragged_by_its_tip_and_stays_near(session: live.Session) -
     T = robot.fk(START)
     T[0, 3] -= 0.02
     session.move_start(T)
-    state = until(session, lambda state: not np.array_equal(state.problem.start, START))
+    state = state_when(session, lambda state: not np.array_equal(state.problem.start, START))
     assert np.abs(state.problem.start - START).max() < 0.3
     np.testing.assert_allclose(robot.fk(state.problem.start), T, atol=1e-5)
-    assert live.validity(until(session, settled)).kind == live.VALID
+    assert live.validity(state_when(session, settled)).kind == live.VALID
 
 
 def test_what_is_wrong_leaves_the_session_as_it_was(session: live.Session) -> None:
@@ -135,7 +131,7 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> Iterator[live.Session]:
     monkeypatch.setitem(PLANNERS, "slow", Entry("helpers.planners:SlowPlanner", "waits"))
     SlowPlanner.calls.clear()
     with started("slow") as session:
-        waiting.until(lambda: SlowPlanner.calls, PATIENCE)
+        until(lambda: SlowPlanner.calls)
         yield session
 
 
@@ -145,7 +141,7 @@ def test_the_latest_request_wins(slow: live.Session) -> None:
         slow.change_obstacle("lamp", lambda shape, T=T: live.moved_to(shape, T))
     for _ in range(2):
         SlowPlanner.go.release()
-    state = until(slow, settled)
+    state = state_when(slow, settled)
     heights = [problem.scene.shapes[0].bounds.mean(axis=0)[2] for problem in SlowPlanner.calls]
     assert heights == pytest.approx([1.5, 1.8]) and state.answer is not None and state.answer.solved
 
@@ -159,9 +155,9 @@ def test_an_overtaken_plan_is_dropped_if_it_is_no_longer_free(slow: live.Session
         assert slow.state.motion is None
         return len(SlowPlanner.calls) == 2
 
-    waiting.until(called_again, PATIENCE)
+    until(called_again)
     SlowPlanner.go.release()
-    assert live.validity(until(slow, settled)).kind == live.VALID
+    assert live.validity(state_when(slow, settled)).kind == live.VALID
 
 
 def test_a_plan_for_a_robot_that_has_gone_is_dropped(slow: live.Session) -> None:
@@ -169,17 +165,17 @@ def test_a_plan_for_a_robot_that_has_gone_is_dropped(slow: live.Session) -> None
     slow.open(rd.Problem(rd.load_robot("ur5"), rd.Scene(), start, rd.JointGoal(start + 0.2)))
     for _ in range(2):
         SlowPlanner.go.release()
-    state = until(slow, lambda state: settled(state) and state.motion)
+    state = state_when(slow, lambda state: settled(state) and state.motion)
     assert state.motion is not None and state.motion.robot == "ur5"
 
 
 def test_a_planner_that_breaks_costs_one_plan(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PLANNERS, "slow", Entry("helpers.planners:SlowPlanner", "waits"))
     with started("slow", "broken") as session:
-        shown = live.validity(until(session, settled))
+        shown = live.validity(state_when(session, settled))
         assert shown.kind == live.NO_MOTION and shown.lines == ("slow failed: RuntimeError: no such luck",)
         session.set_options(planner="aorrtc")
-        assert live.validity(until(session, lambda state: settled(state) and state.motion)).kind == live.VALID
+        assert live.validity(state_when(session, lambda state: settled(state) and state.motion)).kind == live.VALID
 
 
 def test_latest_goes_on_after_an_error(caplog: pytest.LogCaptureFixture) -> None:
@@ -191,9 +187,9 @@ def test_latest_goes_on_after_an_error(caplog: pytest.LogCaptureFixture) -> None
 
     latest = live.LatestTask(do, "test")
     latest.submit(0)
-    waiting.until(lambda: "ZeroDivisionError" in caplog.text, PATIENCE)
+    until(lambda: "ZeroDivisionError" in caplog.text)
     latest.submit(1)
-    assert done.wait(PATIENCE)
+    assert done.wait(300.0)
     latest.close()
 
 

@@ -1,22 +1,20 @@
 """The page of an exploration in a real browser: what it shows while the arm moves, and its buttons."""
 
 from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 import pytest
 
 import robotdiffuse as rd
-from helpers import waiting
-from helpers.browsers import MARKS, PATIENCE, opened
+from helpers.browsers import MARKS, opened
 from helpers.explorations import BEYOND, FLOOR, HOME, WALL
+from helpers.waiting import until
 
 pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
 
 from robotdiffuse.visualization.live import exploration as live
 from robotdiffuse.visualization.live.server import PageServer, free_port
 
-until = partial(waiting.until, patience=PATIENCE)
 pytestmark = MARKS
 
 

@@ -223,10 +223,7 @@ def test_a_scene_and_a_problem_file_allow_contacts(tmp_path: Path) -> None:
     assert loaded.scene.allowed_contacts == ((names[0], ("panda_hand",)), (names[1], "all"))
 
 
-UR5_JOINTS = [
-    *("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"),
-    *("wrist_1_joint", "wrist_2_joint", "wrist_3_joint"),
-]
+UR5_JOINTS = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", *(f"wrist_{i}_joint" for i in (1, 2, 3))]
 
 
 def ur5_files(folder: Path, model: str, more: list[str]) -> Path:
