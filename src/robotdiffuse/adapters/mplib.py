@@ -250,10 +250,7 @@ class Planner:
         """Plan to any of several configurations; see `plan_pose`."""
         goals = np.atleast_2d(_array(goal_qposes))
         if goals.ndim > 2 or goals.shape[1] not in (self.robot.dof, len(self.joint_names)):
-            raise InputError(
-                f"goal_qposes is {shown(goal_qposes)}; it must be rows of {len(self.joint_names)} numbers, "
-                f"the values of {', '.join(self.joint_names)}"
-            )
+            raise InputError(f"goal_qposes is {shown(goal_qposes)}; it must be rows of {self._expected()}")
         ends = goals if goals.shape[1] == self.robot.dof else goals[:, self._places]
         plan = partial(self.workspace.plan, JointGoal(ends))
         return self._planned("planning failed", plan, current_qpos, options)
@@ -362,6 +359,10 @@ class Planner:
         T = matrix(pose)
         return T if options.get("wrt_world", True) else self.workspace.T_world_base @ T
 
+    def _expected(self) -> str:
+        """What joint values must be, for messages."""
+        return f"{len(self.joint_names)} numbers, the values of {', '.join(self.joint_names)}"
+
     def _start(self, qpos: ArrayLike) -> ndarray:
         """The planned joints of `qpos`. Its other joints, such as fingers, are locked at their values in
         `qpos`, rounded to multiples of HELD_JOINT_STEP."""
@@ -369,10 +370,7 @@ class Planner:
         if len(q) == self.robot.dof:
             return q
         if len(q) != len(self.joint_names) or not np.isfinite(q).all():
-            raise InputError(
-                f"qpos is {shown(qpos)}; it must be {len(self.joint_names)} numbers, the values of "
-                f"{', '.join(self.joint_names)}"
-            )
+            raise InputError(f"qpos is {shown(qpos)}; it must be {self._expected()}")
         values = dict(zip(self.joint_names, q.tolist(), strict=True))
         robot = self.workspace.robot
         locked = {

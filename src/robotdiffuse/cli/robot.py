@@ -100,12 +100,13 @@ def print_preparation(report: "AddReport") -> None:
         for name in ("colliding", "falsely by parts", "falsely by spheres")
     ]
     falsely = report.false_collisions
+    parts = sum(link.parts for link in report.links)
     pairs = [
         (", ".join(pair.links), pair.colliding, pair.by_parts, pair.by_spheres)
         for pair in falsely.pairs[:MAX_PAIRS]
     ]
     summary = [
-        ("convex parts, spheres", f"{sum(link.parts for link in report.links)}, {report.sphere_count}"),
+        ("convex parts, spheres", f"{parts}, {report.sphere_count}"),
         ("configurations free of self-collision", f"{falsely.free:.1%}"),
         (
             "of these in false collision by convex parts, by spheres",
@@ -125,8 +126,9 @@ def print_preparation(report: "AddReport") -> None:
 def _print_pairs(report: "AddReport") -> None:
     """Print how many pairs of links are checked, how many are allowed for each reason, and where this differs
     from the SRDF."""
-    reasons = sorted(Counter(pair.reason for pair in report.pairs).items())
-    show(Table.pairs("", [("pairs of links", ", ".join(f"{reason} {count}" for reason, count in reasons))]))
+    reasons = Counter(pair.reason for pair in report.pairs)
+    counted = ", ".join(f"{reason} {count}" for reason, count in sorted(reasons.items()))
+    show(Table.pairs("", [("pairs of links", counted)]))
     if report.srdf is None:
         return
     columns = ("link", "link", "by sampling", Column("colliding", "%", ".1f", scale=100.0), "by the SRDF")
@@ -163,6 +165,5 @@ def _range(joint: Joint) -> tuple[float | None, float | None]:
 
 def _place(T: Float[ndarray, "4 4"]) -> str:
     wxyz = quaternion_from_rotation(T[:3, :3])
-    return " ".join(
-        ["xyz", *(f"{value:g}" for value in T[:3, 3]), "wxyz", *(f"{value:.4g}" for value in wxyz)]
-    )
+    xyz = T[:3, 3]
+    return " ".join(["xyz", *(f"{value:g}" for value in xyz), "wxyz", *(f"{value:.4g}" for value in wxyz)])

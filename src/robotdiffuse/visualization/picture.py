@@ -189,9 +189,9 @@ def _score(
     drawn = obstacle_nearness > 0
     if drawn.any():
         count = owners[-1] + 1
-        hidden = np.bincount(owners[faces[drawn & (arm_nearness >= obstacle_nearness)]], minlength=count)
-        shown = np.bincount(owners[faces[drawn & (arm_nearness < obstacle_nearness)]], minlength=count)
-        score += 0.5 * float((shown / np.maximum(1, shown + hidden)).mean())
+        pixels_drawn = np.bincount(owners[faces[drawn]], minlength=count)
+        pixels_shown = np.bincount(owners[faces[obstacle_nearness > arm_nearness]], minlength=count)
+        score += 0.5 * float((pixels_shown / np.maximum(1, pixels_drawn)).mean())
     pixels = camera.project(trace)
     column = pixels[:, 0].astype(int)
     row = pixels[:, 1].astype(int)

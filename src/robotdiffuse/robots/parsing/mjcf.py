@@ -59,7 +59,8 @@ def compiled_model(path: Path) -> Any:
         return spec.compile()
     except Exception as error:  # MuJoCo raises several kinds of errors for a damaged model
         text = shortened(error, MAX_WORD)
-        remedy = "; meshes are STL, OBJ or MSH files in its meshdir" * text.startswith("Error: Error opening")
+        unopened = text.startswith("Error: Error opening")
+        remedy = "; meshes are STL, OBJ or MSH files in its meshdir" if unopened else ""
         raise InputError(f"{path} is no valid MuJoCo model: {text}{remedy}") from None
 
 

@@ -60,7 +60,7 @@ class Packages(NamedTuple):
         if filename.startswith("package://"):
             package, _, rest = filename.removeprefix("package://").partition("/")
             folder = self.folder(package)
-            places = [folder or start]
+            places = [] if folder is None else [folder]
             places += (up / below for up in (start, *start.parents) for below in (package, ""))
             where = f"the package is {folder}" if folder else f"searched from {start} upwards"
             advice = f" ({where}); give the package's folder: --package {package}=FOLDER, or ROS_PACKAGE_PATH"

@@ -405,31 +405,34 @@ class UrdfTree:
         if self.elements[leaders[-1]].get("type") == "fixed":
             self.notes.append(f"joint {name} mimics the fixed joint {leaders[-1]}; treated as independent")
             return None
-        multiplier = self._numbers(followed.get("multiplier", "1"), 1, f"joint {name}: mimic multiplier")
-        offset = self._numbers(followed.get("offset", "0"), 1, f"joint {name}: mimic offset")
+        location = f"joint {name}: mimic"
+        multiplier = self._numbers(followed.get("multiplier", "1"), 1, f"{location} multiplier")
+        offset = self._numbers(followed.get("offset", "0"), 1, f"{location} offset")
         return Mimic(leaders[1], float(multiplier[0]), float(offset[0]))
 
     def _with_limits(self, joint: Joint, limit: ET.Element | None) -> Joint:
-        attributes = {} if limit is None else {**limit.attrib}
-        if joint.kind == "continuous":
-            attributes |= {"lower": f"-{CONTINUOUS_LIMIT}", "upper": f"{CONTINUOUS_LIMIT}"}
+        attributes = {} if limit is None else limit.attrib
+        largest = {"lower": MAX_COORDINATE, "upper": MAX_COORDINATE, "velocity": MAX_RATE}
+        if joint.kind == "continuous":  # its position limits are ignored
+            largest = {"velocity": MAX_RATE}
         limits = {
-            end: float(
-                self._numbers(attributes.get(end, "0"), 1, f"joint {joint.name}: {end} limit", most)[0]
-            )
-            for end, most in (("lower", MAX_COORDINATE), ("upper", MAX_COORDINATE), ("velocity", MAX_RATE))
+            name: float(self._numbers(attributes[name], 1, f"joint {joint.name}: {name} limit", most)[0])
+            for name, most in largest.items()
+            if name in attributes
         }
-        if not attributes.keys() & {"lower", "upper"}:
+        if joint.kind == "continuous":
+            limits |= {"lower": -CONTINUOUS_LIMIT, "upper": CONTINUOUS_LIMIT}
+        if "lower" not in limits and "upper" not in limits:
             raise InputError(
                 f"{self.path}: joint {joint.name} is {joint.kind} and has no <limit lower= upper=>"
             )
-        lower = limits["lower"]
-        upper = limits["upper"]
+        lower = limits.get("lower", 0.0)
+        upper = limits.get("upper", 0.0)
         if lower > upper:
             raise InputError(
                 f"{self.path}: joint {joint.name}: lower limit {lower} is above upper {upper}; exchange them"
             )
-        velocity = limits["velocity"]
+        velocity = limits.get("velocity", 0.0)
         if 0 < velocity < MIN_RATE:
             raise InputError(
                 f"{self.path}: joint {joint.name}: velocity limit is {velocity:g}; it must be at least "
