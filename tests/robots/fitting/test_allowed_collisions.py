@@ -64,6 +64,14 @@ def with_middle(robot: Robot) -> Robot:
     )
 
 
+def far_apart() -> Robot:
+    """Four joints between links a and c, as between the upper arm and the wrist of a Z1 that is folded at zero."""
+    robot = with_middle(overlapping(0.0))
+    *rest, last = robot.joints
+    turn = Joint("4", "revolute", "m", "n", np.eye(4), last.axis, -1.0, 1.0)
+    return replace(robot, joints=(*rest, turn, replace(last, parent="n")))
+
+
 def carrying(held: dict[str, float] | None = None) -> Robot:
     """Link m carries the hand on a joint, and c, fixed or by locked joints (`held`), as the vendor's Fetch its bellows."""
     robot = with_middle(overlapping(0.0, own=held is not None))
@@ -106,6 +114,7 @@ FOUND = {
     "an arm that cannot fold": (lambda: limited(box_arm(), 0.5), ("l1", "l3"), "never"),
     "joints without geometry between": (lambda: overlapping(0.0), ("a", "c"), "adjacent"),
     "the default pose": (lambda: with_middle(overlapping(0.0)), ("a", "c"), "default"),
+    "the default pose of links far apart": (far_apart, ("a", "c"), "checked"),
     "no pose within the limits": (lambda: with_middle(overlapping(0.02)), ("a", "c"), "checked"),
     "a tool in the default pose": (lambda: with_middle(overlapping(0.0, own=False)), ("a", "c"), "checked"),
     "what a link carries": (carrying, ("a", "c"), "default"),
@@ -127,8 +136,9 @@ def test_pairs_that_need_no_check_are_found(case: str) -> None:
     assert {report.links: report.reason for report in reports}[pair] == found
 
 
-def test_pairs_that_meet_and_are_not_checked_are_told() -> None:
-    pairs = (PairReport(("l1", "l3"), "limits", 0.27), PairReport(("l1", "l2"), "adjacent", 1.0))
+@pytest.mark.parametrize("reason", ["default", "limits", "pose"])
+def test_pairs_that_meet_and_are_not_checked_are_told(reason: str) -> None:
+    pairs = (PairReport(("l1", "l3"), reason, 0.27), PairReport(("l1", "l2"), "adjacent", 1.0))
     report = AddReport(box_arm(), Path(), (), pairs, FalseCollisions(0.7, 0.0, 0.0, ()), 0.0, 0)
     (warning,) = report.warnings
     assert "l1 against l3 is not checked" in warning and "27.0%" in warning

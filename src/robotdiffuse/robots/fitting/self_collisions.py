@@ -29,6 +29,9 @@ MIN_LIMITS_COLLIDING = 0.2
 MAX_LOCKED_JOINTS = 1
 """A link, such as the bellows of a lift, belongs to the arm if at most this many locked joints connect it to
 the arm. Links after more locked joints belong to a head or another arm."""
+MAX_DEFAULT_JOINTS = 3
+"""Pairs of links with more joints between them are not allowed for the reason `default`: limits of single
+joints keep neighbors apart, but not a hand from its own shoulder."""
 MAX_POSE_OVERLAP = 0.03
 """If links overlap in a named pose by less than this [m], the pair is allowed for the reason `pose`."""
 
@@ -77,8 +80,9 @@ def find_allowed_collisions(
     - default: the links collide in the default pose, with the joints between them at zero. If the limits
       include this pose, the manufacturer considers it safe, so the meshes are taken to be too coarse there.
       Both links must belong to the arm, since the limits do not account for a tool on the last link or for
-      another arm. A link behind one locked joint also counts as part of the arm if the pair also collides at
-      the joint's locked value, which planning does not change.
+      another arm, and have at most MAX_DEFAULT_JOINTS joints between them. A link behind one locked joint
+      also counts as part of the arm if the pair also collides at the joint's locked value, which planning
+      does not change.
     - limits: the links collide in at least a fifth of the samples. The value of one joint between the links
       determines whether they collide, and they collide at a stop of this joint: joints often have their stops
       where the links on both sides meet.
@@ -89,12 +93,13 @@ def find_allowed_collisions(
     one, the pair is checked.
     """
     links = Links(robot)
-    default = np.clip(np.zeros((1, len(links.joints))), links.lower, links.upper)
+    default = np.clip(0.0, links.lower, links.upper)[None]
     q = links.random(settings.samples, rng)
     poses = links.poses(q)
     default_poses = links.poses(default)
-    locked_poses = links.poses(links.named({})[None])
-    named_poses = [links.poses(links.named(pose)[None]) for pose in robot.poses.values()]
+    locked_poses, *named_poses = (
+        links.poses(links.named(pose)[None]) for pose in ({}, *robot.poses.values())
+    )
     adjacent = _adjacent(robot) if settings.assumptions else set[frozenset[str]]()
 
     def reason(a: str, b: str, distances: ndarray, colliding: ndarray) -> str:
@@ -104,9 +109,10 @@ def find_allowed_collisions(
             return "always"
         if settings.assumptions:
             between = _own_between(robot, a, b, MAX_LOCKED_JOINTS)
-            zero_allowed = between is not None and all(joint.lower <= 0 <= joint.upper for joint in between)
             if (
-                zero_allowed
+                between is not None
+                and len(between) <= MAX_DEFAULT_JOINTS
+                and all(joint.lower <= 0 <= joint.upper for joint in between)
                 and links.collide(default_poses, a, b, 0)
                 and links.collide(locked_poses, a, b, 0)
             ):
@@ -277,7 +283,10 @@ def measure_false_collisions(
         collisions.append((spheres, parts, meshes, middle))
     if not collisions:
         return FalseCollisions(1.0, 0.0, 0.0, ())
-    free = ~np.any([meshes for _, _, meshes, _ in collisions], axis=0)
+    any_spheres, any_parts, any_meshes = (
+        np.any(rows, axis=0) for rows in list(zip(*collisions, strict=True))[:3]
+    )
+    free = ~any_meshes
     count = max(int(free.sum()), 1)
 
     def share(colliding: ndarray) -> float:
@@ -305,9 +314,8 @@ def measure_false_collisions(
         pairs.append(
             PairFalseCollisions((a, b), float(meshes.mean()), *shares, all_gaps, places, sticking_out)
         )
-    spheres, parts, _ = (np.any(rows, axis=0) for rows in list(zip(*collisions, strict=True))[:3])
     worst_first = sorted(pairs, key=lambda pair: -pair.by_spheres)
-    return FalseCollisions(float(free.mean()), share(parts), share(spheres), tuple(worst_first))
+    return FalseCollisions(float(free.mean()), share(any_parts), share(any_spheres), tuple(worst_first))
 
 
 def _sticking_out(
