@@ -191,6 +191,16 @@ def test_limits_file(tmp_path: Path) -> None:
         refuses(re.escape(message), lambda: with_limits(read_urdf(urdf(tmp_path)), read_limits(file)[0]))
 
 
+def test_limits_of_a_file_decide_which_joints_are_held(tmp_path: Path) -> None:
+    """A joint with equal new limits was planned, which inverse kinematics cannot do; a held joint stayed outside of its."""
+    tree = UrdfTree(urdf(tmp_path, ARM.replace("</robot>", GRIPPER)), {})
+    limits = {"bend": {"lower": 0.5, "upper": 0.5, "velocity": 2.0}, "grip": {"lower": 0.02}}
+    robot = tree.robot(limits=limits)
+    assert robot.joint_names == ("turn",)
+    assert robot.locked == {"bend": 0.5, "grip": 0.02, "grip2": 0.02}
+    assert not any("no velocity limit" in note for note in robot.notes)
+
+
 def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
     # balls, because they are fitted quickly

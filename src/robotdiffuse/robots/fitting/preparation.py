@@ -48,7 +48,7 @@ from robotdiffuse.robots.fitting.sphere_fitting import (
 )
 from robotdiffuse.robots.kinematic_tree import MOVING_KINDS
 from robotdiffuse.robots.parsing.srdf import read_srdf, srdf_beside
-from robotdiffuse.robots.parsing.urdf import UrdfTree, read_limits, with_limits
+from robotdiffuse.robots.parsing.urdf import UrdfTree, read_limits
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import (
     FILE_ENDINGS,
@@ -471,6 +471,7 @@ MAX_PROPOSED = 3
 """Largest number of pairs that the error message proposes for a robot that always collides with itself
 although no single pair always collides."""
 ASSUMED_SAFE = {
+    "default": "also with all joints between them at zero: the meshes are assumed to be too large",
     "limits": "which reach up to a limit of one joint: the limit is assumed to be where the links meet",
     "pose": "also in a pose that the SRDF names: the meshes are assumed to be too large",
 }
@@ -584,7 +585,8 @@ def add_robot(
     tree = UrdfTree(Path(urdf), packages or {}, compile_xacro=True)
     srdf_file = Path(srdf) if srdf is not None else None if tree.semantics else srdf_beside(urdf, tree.name)
     semantics = tree.semantics if srdf_file is None else read_srdf(srdf_file)
-    robot = tree.robot(base, tip, locked, group, semantics)
+    changed, notes = ({}, ()) if limits is None else read_limits(limits)
+    robot = tree.robot(base, tip, locked, group, semantics, changed)
     for pair in allow:
         for link in pair:
             check_name("link in allow", link, robot.link_names)
@@ -600,10 +602,7 @@ def add_robot(
     folder = user_robots() / name if out is None else Path(out)
     with lock_folder(folder):  # fails early if the folder cannot be written
         pass
-    robot = replace(robot, name=name)
-    if limits is not None:
-        changed, notes = read_limits(limits)
-        robot = replace(with_limits(robot, changed), notes=(*robot.notes, *notes))
+    robot = replace(robot, name=name, notes=(*robot.notes, *notes))
     if not robot.meshes:
         raise InputError(
             f"{urdf}: no link has collision or visual geometry, so collisions cannot be checked; add "

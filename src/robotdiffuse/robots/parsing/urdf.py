@@ -3,7 +3,7 @@
 import hashlib
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -177,6 +177,7 @@ class UrdfTree:
         locked: dict[str, float] | None = None,
         group: str | None = None,
         srdf: Srdf | None = None,
+        limits: Mapping[str, dict[str, float]] | None = None,
     ) -> Robot:
         """The robot, with convex collision meshes and without spheres.
 
@@ -186,7 +187,7 @@ class UrdfTree:
         zero, clipped to their limits. Locked mimic joints follow the joints that they mimic.
 
         Acceleration and jerk limits, which URDF lacks, are 4 / s times the velocity limit and 10 / s times
-        the acceleration limit; `with_limits` changes them. Each collision element becomes a convex hull in
+        the acceleration limit; `limits` may change them. Each collision element becomes a convex hull in
         the link's frame; cylinders, capsules and spheres become polyhedra around the shape. If no link has
         collision elements, visual elements are used, with a note.
 
@@ -201,6 +202,7 @@ class UrdfTree:
                 "all" for all arms. A group of several chains, such as two arms, is one robot with several
                 tips. Without group and tip, the robot must have exactly one arm.
             srdf: Source of groups, named poses and passive joints.
+            limits: Limits that replace those of the file, see `with_limits`.
 
         Raises:
             InputError: If the file or the arguments are incomplete or contradictory; it names the file.
@@ -216,7 +218,12 @@ class UrdfTree:
         notes = [
             f"joint {joint.name} is passive; it is held" for joint in joints if joint.name in srdf.passive
         ]
-        unlimited = [joint.name for joint in joints if joint.name in planned and joint.name in self.unlimited]
+        limits = limits or {}
+        unlimited = [
+            joint.name
+            for joint in joints
+            if joint.name in planned & self.unlimited and "velocity" not in limits.get(joint.name, ())
+        ]
         if unlimited:
             notes.append(f"no velocity limit for {joined(unlimited)}; {DEFAULT_VELOCITY:g} assumed")
         robot = Robot(
@@ -232,17 +239,17 @@ class UrdfTree:
             poses=dict(srdf.poses),
             inertias=inertias,
         )
+        robot = with_limits(robot, limits)
+        movable = [joint for joint in robot.joints if joint.kind in MOVING_KINDS]
+        fixed_joints = [joint.name for joint in movable if joint.lower == joint.upper]
         resting = srdf.resting()
         rest = {
             joint.name: float(np.clip(resting.get(joint.name, 0.0), joint.lower, joint.upper))
-            for joint in joints
-            if joint.kind in MOVING_KINDS and (joint.name not in planned or joint.lower == joint.upper)
+            for joint in movable
+            if joint.name not in planned.difference(fixed_joints)
         }
         robot = replace(robot, locked=with_mimics(robot.joints, rest)).with_locked(locked or {})
         if robot.dof == 0:
-            fixed_joints = [
-                joint.name for joint in joints if joint.kind in MOVING_KINDS and joint.lower == joint.upper
-            ]
             raise InputError(
                 f"{self.path}: no movable joint between {base} and {ends[0]}; "
                 + (
@@ -639,7 +646,7 @@ def read_limits(file: str | Path) -> tuple[dict[str, dict[str, float]], tuple[st
     return {str(name): _fields(str(file), str(name), entry) for name, entry in joints.items()}, notes
 
 
-def with_limits(robot: Robot, limits: dict[str, dict[str, float]]) -> Robot:
+def with_limits(robot: Robot, limits: Mapping[str, dict[str, float]]) -> Robot:
     """The robot with changed limits, given by joint and field. Raises InputError for an unknown joint, and
     for a lower limit above the upper one.
 
@@ -647,13 +654,10 @@ def with_limits(robot: Robot, limits: dict[str, dict[str, float]]) -> Robot:
     default ratios, unless these limits are given too. A continuous joint with a position limit becomes
     revolute; if only one of its limits is given, the other one is half a turn from zero.
     """
-    movable = {joint.name: joint for joint in robot.joints if joint.kind in MOVING_KINDS}
+    movable = [joint.name for joint in robot.joints if joint.kind in MOVING_KINDS]
     for name in limits:
         check_name("joint in joint_limits", name, movable)
-    changed = [
-        _changed(joint, limits[joint.name]) if joint.name in limits else joint for joint in robot.joints
-    ]
-    return replace(robot, joints=tuple(changed))
+    return replace(robot, joints=tuple(_changed(joint, limits.get(joint.name, {})) for joint in robot.joints))
 
 
 def _fields(file: str, joint: str, entry: object) -> dict[str, float]:
