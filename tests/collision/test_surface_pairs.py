@@ -1,8 +1,10 @@
 """Grazing links: where the convex parts of two links touch, their meshes decide."""
 
+import errno
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -137,6 +139,20 @@ def test_folders_keep_the_surfaces_and_refuse_those_of_other_meshes(tmp_path: Pa
     write_robot_folder(other, tmp_path, {})
     (tmp_path / SURFACE_FILE).write_bytes(packed)
     refuses(SURFACE_FILE, read_robot_folder, tmp_path)
+
+
+def test_a_folder_without_its_surfaces_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: robot.json was written first, so that after a full disk or a kill the arm was read without surfaces."""
+    save = np.savez_compressed
+
+    def until_full(file: Any, **arrays: Any) -> None:
+        if "grazing" in arrays:
+            raise OSError(errno.ENOSPC, "full")
+        save(file, **arrays)
+
+    monkeypatch.setattr(np, "savez_compressed", until_full)
+    refuses("cannot be written: full", write_robot_folder, channel(), tmp_path, {})
+    refuses("robot.json", read_robot_folder, tmp_path)
 
 
 def test_baxters_torso_and_arms_graze_as_trimesh_finds_too() -> None:

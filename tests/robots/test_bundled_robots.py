@@ -1,5 +1,6 @@
 """Bundled robots: spheres cover their meshes, cause few false collisions, and NOTICE names the robots."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -7,13 +8,14 @@ import pytest
 import trimesh
 
 import robotdiffuse as rd
+from helpers.refusals import refuses
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import DATA, ROBOTS, load_robot
 from robotdiffuse.robots.fitting.sphere_fitting import is_inside, stacked_planes
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import gaps
-from robotdiffuse.robots.robot_folder import read_source
+from robotdiffuse.robots.robot_folder import read_source, user_robots
 
 NOTICE = (Path(__file__).parents[2] / "NOTICE").read_text()
 
@@ -41,6 +43,15 @@ def test_what_spheres_call_free_is_free_and_little_else_is(name: str) -> None:
     by_meshes = ~ExactCollision(robot, scene).collides(q)
     assert not (by_spheres & ~by_meshes).any()
     assert by_meshes.mean() > 0.4 and (by_meshes & ~by_spheres).sum() < 0.12 * by_meshes.sum()
+
+
+def test_a_user_without_a_home_has_bundled_robots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: in a container whose user has no home, names of robots raised a RuntimeError."""
+    for name in ("HOME", "XDG_DATA_HOME", "ROBOTDIFFUSE_ROBOTS"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os, "getuid", lambda: 2**31 - 2)
+    assert user_robots() == Path("/.local/share/robotdiffuse/robots")
+    refuses("unknown robot 'nothing'; known: baxter", load_robot, "nothing")
 
 
 @pytest.mark.parametrize("name", ROBOTS)

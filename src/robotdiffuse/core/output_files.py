@@ -19,10 +19,15 @@ from robotdiffuse.core.input_files import file_name
 DISK_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
-def write_error(file: Path, error: OSError) -> InputError:
-    """The error for a file or folder that could not be written."""
-    kind = OutputError if error.errno in DISK_FAILURES else InputError
-    return kind(f"{file} cannot be written: {error.strerror or error}")
+@contextmanager
+def writing(file: Path) -> Iterator[None]:
+    """Within the block, an OSError becomes the error for a file or folder that could not be written:
+    OutputError for an error of the disk, such as a full one, otherwise InputError."""
+    try:
+        yield
+    except OSError as error:
+        kind = OutputError if error.errno in DISK_FAILURES else InputError
+        raise kind(f"{file} cannot be written: {error.strerror or error}") from None
 
 
 def write_atomically(
@@ -37,7 +42,7 @@ def write_atomically(
     cannot be written, and its subclass OutputError for an error of the disk, such as a full one.
     """
     temporary = file.with_name(f".{file.name}.{secrets.token_hex(8)}.tmp")
-    try:
+    with writing(file):
         if make_folder:
             file.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -51,8 +56,6 @@ def write_atomically(
             with suppress(OSError):
                 temporary.unlink()
             raise
-    except OSError as error:
-        raise write_error(file, error) from None
 
 
 @contextmanager
@@ -62,7 +65,7 @@ def replaced_folder(target: Path) -> Iterator[Path]:
 
     Raises InputError as `write_atomically` does.
     """
-    try:
+    with writing(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(
             prefix=f".{target.name}.", dir=target.parent, ignore_cleanup_errors=True
@@ -78,8 +81,12 @@ def replaced_folder(target: Path) -> Iterator[Path]:
                 with suppress(OSError):
                     old.replace(target)
                 raise
-    except OSError as error:
-        raise write_error(target, error) from None
+
+
+def check_not_input(out: Path, *inputs: str | None) -> None:
+    """Raise InputError if the file or folder `out` is one of the inputs."""
+    if os.path.realpath(out) in map(os.path.realpath, filter(None, inputs)):
+        raise InputError(f"{out} is an input of this command; name another output")
 
 
 def check_output(file: str | Path, endings: tuple[str, ...], *inputs: str | None) -> Path:
@@ -90,8 +97,7 @@ def check_output(file: str | Path, endings: tuple[str, ...], *inputs: str | None
     the subclass OutputError for a full disk.
     """
     path = file_name(file)
-    if any(name is not None and os.path.realpath(path) == os.path.realpath(name) for name in inputs):
-        raise InputError(f"{path} is an input of this command; name another file")
+    check_not_input(path, *inputs)
     if path.suffix.lower() not in endings:
         raise InputError(f"{path}: unknown ending {shown(path.suffix)}; known: {', '.join(endings)}")
     if path.is_dir():
@@ -99,12 +105,10 @@ def check_output(file: str | Path, endings: tuple[str, ...], *inputs: str | None
     if not path.parent.is_dir():
         why = "is a file, not a folder" if path.parent.exists() else "does not exist"
         raise InputError(f"{path}: the folder {path.parent} {why}")
-    try:
+    with writing(path):
         TemporaryFile(dir=path.parent).close()
         if path.exists() and not os.access(path, os.W_OK):
             raise PermissionError("permission denied")
-    except OSError as error:
-        raise write_error(path, error) from None
     return path
 
 
@@ -113,7 +117,7 @@ def append_line(file: Path, line: str, make_folder: bool = False) -> None:
 
     If writing fails, an existing `file` keeps its content. Raises InputError as `write_atomically` does.
     """
-    try:
+    with writing(file):
         if make_folder:
             file.parent.mkdir(parents=True, exist_ok=True)
         with file.open("ab", buffering=0) as stream:
@@ -126,8 +130,6 @@ def append_line(file: Path, line: str, make_folder: bool = False) -> None:
             except BaseException:
                 stream.truncate(size)
                 raise
-    except OSError as error:
-        raise write_error(file, error) from None
 
 
 class JsonLines:
@@ -180,14 +182,13 @@ def lock_folder(out: Path) -> Iterator[None]:
     Raises InputError if another process holds the lock or the folder cannot be made or written into.
     """
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    try:
-        out.mkdir(parents=True, exist_ok=True)
+    with writing(out):
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except FileExistsError:
+            raise InputError(f"cannot use the folder {out}: it is a file") from None
         TemporaryFile(dir=out).close()
         folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
-    except FileExistsError:
-        raise InputError(f"cannot use the folder {out}: it is a file") from None
-    except OSError as error:
-        raise write_error(out, error) from None
     try:
         try:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)

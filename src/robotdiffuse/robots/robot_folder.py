@@ -31,7 +31,7 @@ from robotdiffuse.core.errors import (
     within,
 )
 from robotdiffuse.core.input_files import is_file, read_arrays, read_json
-from robotdiffuse.core.output_files import lock_folder, write_atomically, write_error
+from robotdiffuse.core.output_files import lock_folder, write_atomically, writing
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.robots.bodies import ConvexMesh, Surface, inertia_of
 from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT, LIMITS, MOVING_KINDS, Joint, Mimic
@@ -44,8 +44,9 @@ def user_robots() -> Path:
     chosen = os.environ.get("ROBOTDIFFUSE_ROBOTS")
     if chosen:
         return Path(chosen)
-    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
-    return Path(data) / "robotdiffuse" / "robots"
+    # a user without a home, as in a container, gets a folder in /, which cannot be written
+    data = os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share").lstrip("~")
+    return Path(data, "robotdiffuse", "robots")
 
 
 M = TypeVar("M", bound=Surface)
@@ -64,7 +65,7 @@ MESH_FILE = "meshes.npz"
 
 
 def write_robot_folder(robot: Robot, folder: str | Path, source: dict[str, Any]) -> None:
-    """Write robot.json, meshes.npz and, for grazing links, surfaces.npz into a folder. Each file is written
+    """Write meshes.npz, for grazing links surfaces.npz, and robot.json into a folder. Each file is written
     atomically; other files in the folder stay.
 
     `source` describes the robot's origin by the keys urdf, sha256 and license. If preparation measured them,
@@ -74,23 +75,21 @@ def write_robot_folder(robot: Robot, folder: str | Path, source: dict[str, Any])
     """
     folder = Path(folder)
     arrays = _packed([(link, mesh) for link, meshes in robot.meshes.items() for mesh in meshes])
-    try:
-        with lock_folder(folder):
-            for file in (ROBOT_FILE, SURFACE_FILE):  # existing files may belong to other meshes
-                (folder / file).unlink(missing_ok=True)
-            write_atomically(folder / MESH_FILE, _npz(arrays))
-            write_atomically(folder / ROBOT_FILE, _dump(_to_json(robot, source)) + "\n")
-            if robot.grazing:
-                arrays = _packed([*robot.surfaces.items()])
-                arrays |= {
-                    "vertices": arrays["vertices"].astype(np.float32),  # relative error of at most 6e-8
-                    "faces": arrays["faces"].astype(np.int32),
-                    "grazing": np.array(sorted(sorted(pair) for pair in robot.grazing), np.str_),
-                    "of": np.array(_digest(robot)),
-                }
-                write_atomically(folder / SURFACE_FILE, _npz(arrays))
-    except OSError as error:
-        raise write_error(folder, error) from None
+    with writing(folder), lock_folder(folder):
+        for file in (ROBOT_FILE, SURFACE_FILE):  # existing files may belong to other meshes
+            (folder / file).unlink(missing_ok=True)
+        write_atomically(folder / MESH_FILE, _npz(arrays))
+        if robot.grazing:
+            arrays = _packed([*robot.surfaces.items()])
+            arrays |= {
+                "vertices": arrays["vertices"].astype(np.float32),  # relative error of at most 6e-8
+                "faces": arrays["faces"].astype(np.int32),
+                "grazing": np.array(sorted(sorted(pair) for pair in robot.grazing), np.str_),
+                "of": np.array(_digest(robot)),
+            }
+            write_atomically(folder / SURFACE_FILE, _npz(arrays))
+        # last: without this file, a folder that was written in part is not read
+        write_atomically(folder / ROBOT_FILE, _dump(_to_json(robot, source)) + "\n")
 
 
 def _npz(arrays: dict[str, ndarray]) -> bytes:
