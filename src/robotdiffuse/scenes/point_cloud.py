@@ -47,12 +47,15 @@ def read_octomap(file: str | Path) -> tuple[Points, float]:
         for line in header.decode("ascii", "replace").split("\n")
         if len(line.split()) > 1
     )
-    if fields.get("id") != "OcTree":
-        raise InputError(f"octomap {file} holds {shown(fields.get('id'))}; it must be an OcTree")
+    for word in ("id", "res"):
+        if word not in fields:
+            raise InputError(f"octomap {file} is damaged: its header has no value of {word}")
+    if fields["id"] != "OcTree":
+        raise InputError(f"octomap {file} holds {shown(fields['id'])}; it must be an OcTree")
     try:
         if not data and fields.get("size", "0") != "0":
             raise InputError("the tree ends too soon")
-        edge = float(fields.get("res", ""))
+        edge = float(fields["res"])
         return occupied_voxels(data, edge), edge
     except ValueError as error:
         raise InputError(f"octomap {file} is damaged: {error}") from None

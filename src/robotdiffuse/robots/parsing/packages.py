@@ -131,10 +131,11 @@ def _by_xacro(xacro: Any, known: Any, path: Path, packages: Packages) -> bytes:
             why = " ".join(str(error).split())
             missing = PACKAGE_NOT_FOUND.search(why)
             if missing is None:
-                raise InputError(
-                    f"{path}: xacro cannot compile it ({why}); compile it with its arguments: xacro "
-                    f"{path.name} NAME:=VALUE > {path.name.split('.')[0]}.urdf"
-                ) from None
+                text = f"{path}: xacro cannot compile it ({why})"
+                if "Undefined substitution argument" in why:
+                    urdf = f"{path.name.split('.')[0]}.urdf"
+                    text += f"; compile it with its arguments: xacro {path.name} NAME:=VALUE > {urdf}"
+                raise InputError(text) from None
             name = missing[1]
             folder = packages.folder(name)
             if folder is None:
