@@ -172,7 +172,7 @@ def test_a_log_says_what_is_compiled(monkeypatch: pytest.MonkeyPatch, capsys: py
         while "\n" not in said:
             time.sleep(0.01)
             said += capsys.readouterr().err
-    assert said.splitlines()[0] == "planning: compiling, once on this machine; 1 functions so far (search)"
+    assert said.splitlines()[0] == "planning: compiling, once on this machine; 1 so far (search)"
 
 
 def test_a_spinner_that_ends_as_it_appears_gives_stdout_back(monkeypatch: pytest.MonkeyPatch) -> None:

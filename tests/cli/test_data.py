@@ -59,11 +59,11 @@ def test_export(folder, said: Said):
     folder = folder.parent / "spheres"
     write_motions(folder, PANDA, [record(PANDA, two, line(START, GOAL, 254))], waypoints=254)
     file = folder.parent / "robot.npz"
-    assert "1 motions" in said(0, "data", "export", folder, file)
+    assert "1 motion;" in said(0, "data", "export", folder, file)
     with np.load(file) as arrays:
         assert arrays["x_train"].shape == (1, 254, 7) and arrays["y_train"].shape == (1, 23)
     again = folder.parent / "again"
-    assert f"1 motions in {again}" in said(0, "data", "import", file, "--out", again, "--radius", 0.2)
+    assert f"1 motion in {again}" in said(0, "data", "import", file, "--out", again, "--radius", 0.2)
     assert run("data", "check", again, "--no-pybullet", "--workers", 1) == 0
 
 

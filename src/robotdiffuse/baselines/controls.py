@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from robotdiffuse.baselines.straight_line import shortest_accepted, straight_lines
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.settings import Count, Natural, OneOf, Settings
 from robotdiffuse.core.types import Configuration, Configurations, PlanResult
 from robotdiffuse.datasets.shards import SPLITS, read_manifest, read_rows
@@ -109,7 +109,9 @@ class Control(Planner[ControlSettings]):
             result = shortest_accepted(context, start_goal, batch, self.settings.source)
             if result is not None:
                 return result
-        return context.unsolved(f"the straight line and {self.settings.samples} candidates are refused")
+        return context.unsolved(
+            f"the straight line and {counted(self.settings.samples, 'candidate')} are refused"
+        )
 
 
 def smooth_noise(

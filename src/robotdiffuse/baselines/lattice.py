@@ -29,7 +29,7 @@ import numpy as np
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import make_scratch, motion_free
 from robotdiffuse.collision.motions import FINEST_RESOLUTION
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.kernels import allocation_free, kernel
 from robotdiffuse.core.settings import Bound, Count, Positive
 from robotdiffuse.core.types import Configuration, Configurations, PlanResult, Status
@@ -329,7 +329,7 @@ class AStar(Planner[DStarLiteSettings]):
         for settings, _ in ever_finer(context, self.settings):
             search = LatticeSearch(start_goal.checker, *start_goal.leads(), settings)
             outcome = search.run(lambda: context.remaining <= 0)
-            after = f"after {search.expansions} expansions"
+            after = f"after {counted(search.expansions, 'expansion')}"
             path = search.path()
             if path is None:
                 spacing = f"{self.name}.spacing (now {settings.spacing:g} rad)"

@@ -86,7 +86,7 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
             if candidate.broken == 0:
                 methods = " and RRT-Connect" if planning.searched else ""
                 reason = (
-                    f"solved by {self.name}: round {rounds}, after {planning.replanned} neural replannings"
+                    f"solved by {self.name}: round {rounds}; neural replannings: {planning.replanned}"
                     f"{methods}"
                 )
                 result = context.finish(start_goal.complete(candidate.path), self.name, reason)
@@ -97,8 +97,8 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
                 best = candidate
         result = None if best is None else context.finish(start_goal.complete(best.path), self.name)
         return result or context.unsolved(
-            f"no path of the network was valid in {context.elapsed:.2f} s and {rounds} rounds of "
-            f"{settings.attempts} attempts; a longer time limit or hybrid replanning may find one"
+            f"no path of the network was valid in {context.elapsed:.2f} s, by round {rounds}; a "
+            "longer time limit or hybrid replanning may find one"
         )
 
 

@@ -222,5 +222,5 @@ def describe_claim(claim: Claim) -> str:
 
 def _place(proof: StretchProof, i: int) -> str:
     stretches = proof.stretches
-    claim = proof.claims[int(stretches.claim[i])]
-    return f"{describe_claim(claim)} from row {stretches.start[i]:g} to row {stretches.stop[i]:g}"
+    rows = f"from row {stretches.start[i]:g} to row {stretches.stop[i]:g}"
+    return f"{describe_claim(proof.claims[int(stretches.claim[i])])} {rows}"

@@ -784,8 +784,8 @@ def _agreement_errors(
         np.concatenate([acceleration_slack, acceleration_slack[-1:]]),
     )
     for j in np.flatnonzero(~(off <= AGREEMENT * peak + slack).all(axis=0)):
-        name = robot.joint_names[j]
-        yield f"motion: accelerations of {name} are {off[:, j].max():.4g} off those of its cubics"
+        excess = f"{off[:, j].max():.4g} off those of its cubics"
+        yield f"motion: accelerations of {robot.joint_names[j]} are {excess}"
 
 
 def at_goal(

@@ -7,7 +7,7 @@ from typing import Any
 
 from robotdiffuse.cli.arguments import Namespace, check_workers, chosen
 from robotdiffuse.cli.console import progress
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.tables import Table, show
 from robotdiffuse.core.types import Path as Waypoints
@@ -36,9 +36,7 @@ def run_run(arguments: Namespace) -> None:
     for settings in _bench_settings(arguments):
         with progress("calls") as update:
             calls_made += run_bench(settings, _say, update)
-    print(
-        f"{calls_made} calls made; for tables, plots and replays: robotdiffuse bench report {arguments.out}"
-    )
+    print(f"{counted(calls_made, 'call')} made; tables and plots: robotdiffuse bench report {arguments.out}")
 
 
 def _say(text: str) -> None:
@@ -63,8 +61,11 @@ def _changes(arguments: Namespace, settings: Any) -> dict[str, Any]:
     """The settings that the command's options set. By default, there is one worker process for every two
     cores."""
     check_workers(arguments)
-    options = chosen(arguments, settings.__dataclass_fields__)
-    return {"workers": HALF_OF_CORES} | options | {"out": Path(arguments.out)}
+    return (
+        {"workers": HALF_OF_CORES}
+        | chosen(arguments, settings.__dataclass_fields__)
+        | {"out": Path(arguments.out)}
+    )
 
 
 def run_report(arguments: Namespace) -> None:
@@ -82,7 +83,9 @@ def run_report(arguments: Namespace) -> None:
         show(main_table(section, section.main, bench.reference))
         print(missing_line(section.main), end="\n\n" if section.main.missing else "\n")
     files = ["index.html", *([replays] if replays else []), "report.md"]
-    print(f"wrote {', '.join(str(out / name) for name in files)} and {len(report.plots)} plots as .svg")
+    print(
+        f"wrote {', '.join(str(out / name) for name in files)}, {counted(len(report.plots), 'plot')} as .svg"
+    )
 
 
 def _write_replays(motions: list[Replay], file: Path) -> None:
@@ -163,7 +166,7 @@ def run_figures(arguments: Namespace) -> int:
     by_steps = paper.plot_success_by_steps(paper.success_by_steps(out, count))
     report.plot(
         "figure1_steps.svg",
-        f"Success against T, the number of denoising steps; {count} problems, 95 % intervals",
+        f"Success against T, the number of denoising steps; {counted(count, 'problem')}, 95 % intervals",
         by_steps,
     )
     report.add("## Figure 3")

@@ -75,7 +75,7 @@ class Spinner:
         count = len(compiled) - self._compiled
         if count == 0:
             return self.text
-        return f"{self.text}: compiling, once on this machine; {count} functions so far ({compiled[-1]})"
+        return f"{self.text}: compiling, once on this machine; {count} so far ({compiled[-1]})"
 
 
 @contextmanager
@@ -133,8 +133,8 @@ def print_result(result: "PlanResult", requested: float | None = None) -> None:
         ("planning time", f"{1e3 * result.planning_time:.1f} ms"),
     ]
     if result.path is not None:
-        rows.append(("path", f"{len(result.path.positions)} waypoints, length {result.path.length:.3f} rad"))
-        rows.append(("verified", "yes"))
+        size = f"{len(result.path.positions)} waypoints, length {result.path.length:.3f} rad"
+        rows += [("path", size), ("verified", "yes")]
     if result.assumption:
         text = ASSUMPTION_TEXTS.get(result.assumption, f"what was seen, and {result.assumption}")
         rows.append(("keeps clear of", text))

@@ -8,7 +8,7 @@ from pathlib import Path
 from robotdiffuse.cli.arguments import Namespace, check_workers, chosen
 from robotdiffuse.cli.console import progress
 from robotdiffuse.cli.view import open_in_browser
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.output_files import check_output
 from robotdiffuse.core.tables import show
 from robotdiffuse.datasets.external import export_npz, import_npz
@@ -34,7 +34,9 @@ def run_generate(arguments: Namespace) -> None:
     with progress("trajectories") as update:
         workers = arguments.workers or os.cpu_count() or 1
         count = generate(settings, Path(arguments.out), workers, arguments.cluster, update)
-    print(f"{count:,} trajectories of {settings.waypoints} waypoints in {arguments.out}")
+    print(
+        f"{counted(count, 'trajectory', 'trajectories')} of {settings.waypoints} waypoints in {arguments.out}"
+    )
 
 
 def run_info(arguments: Namespace) -> None:
@@ -90,14 +92,12 @@ def _gallery_entries(folder: Path, robot: Robot, number: int, seed: int) -> Iter
 
 def run_export(arguments: Namespace) -> None:
     count, left_out = export_npz(arguments.folder, arguments.file)
-    print(
-        f"wrote {arguments.file}: {count:,} motions; {left_out:,} left out, whose scenes are not two spheres"
-    )
+    print(f"wrote {arguments.file}: {counted(count, 'motion')}; {left_out:,} left out, not of two spheres")
 
 
 def run_import(arguments: Namespace) -> None:
     with progress("importing motions") as update:
         count = import_npz(arguments.file, arguments.out, arguments.robot, arguments.radius, update)
     print(
-        f"{count:,} motions in {arguments.out}; validate them with: robotdiffuse data check {arguments.out}"
+        f"{counted(count, 'motion')} in {arguments.out}; to validate: robotdiffuse data check {arguments.out}"
     )

@@ -74,8 +74,9 @@ def explore_shelf(problem: Problem, outputs: list[Path]) -> int:
     explorer, arrived = simulate(problem, ExplorerSettings(time_limit=EXPLORE_TIME_LIMIT), None, 0)
     views = sum(record.step.kind == LOOK for record in explorer.steps)
     end = "is at the goal" if arrived else "is not at the goal"
-    images = len(explorer.views)
-    print(f"The arm {end}: {views} motions to viewpoints, {images} images, {explorer.duration:.1f} s.")
+    print(
+        f"The arm {end} after {explorer.duration:.1f} s; viewpoints: {views}, images: {len(explorer.views)}."
+    )
     for file in outputs:
         draw_exploration(explorer, problem, file)
         print(f"wrote {file.resolve()}")

@@ -61,8 +61,9 @@ def simulate(
     for number, event in enumerate(explore(problem, explorer, noise, seed), 1):
         print(f"{number}. {event.step.kind}: {event.step.reason}")
         if event.step.motion is not None:
-            duration = event.step.motion.duration or 0.0
-            print(f"   {duration:.2f} s; in the true scene: {event.violation or 'free'}")
+            print(
+                f"   {event.step.motion.duration or 0:.2f} s; in the true scene: {event.violation or 'free'}"
+            )
         shares = (100 * part.mean() for part in (explorer.map.free, explorer.map.unknown))
         print("   of the map {:.0f} % seen free, {:.0f} % unknown".format(*shares))
         reached = event.step.kind == DONE

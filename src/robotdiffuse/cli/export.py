@@ -2,7 +2,7 @@
 
 from robotdiffuse.cli.arguments import Namespace
 from robotdiffuse.cli.verify import read_solved
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop import check_export, write_motion
 from robotdiffuse.interop.recorded_motion import publish
@@ -40,4 +40,4 @@ def run_publish(arguments: Namespace) -> None:
     host, port = arguments.to
     _, trajectory = validated_motion(arguments.result)
     publish(trajectory, host, port, arguments.topic, arguments.timeout)
-    print(f"published {len(trajectory.times)} rows on {arguments.topic} at {host}:{port}")
+    print(f"published {counted(len(trajectory.times), 'row')} on {arguments.topic} at {host}:{port}")

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.cli.arguments import Namespace
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.interrupts import exit_on_interrupt
 from robotdiffuse.core.tables import Column, Table, show
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation
@@ -36,8 +36,7 @@ def run_list(arguments: Namespace) -> None:
         spheres = sum(map(len, robot.spheres.values()))
         weights = "no" if weights_for("model", robot) is None else "yes"
         refused = read_source(place).get("refused")
-        pairs = len(robot.checked_pairs())
-        rows.append((name, robot.dof, spheres, pairs, refused, weights, str(place)))
+        rows.append((name, robot.dof, spheres, len(robot.checked_pairs()), refused, weights, str(place)))
     refused = Column("false collisions", "%", ".1f", scale=100.0)
     columns = ("robot", "joints", "spheres", "checked pairs", refused, "weights", Column("folder", left=True))
     show(Table.of("", columns, rows))
@@ -151,7 +150,11 @@ def print_robot(robot: Robot) -> None:
         pairs.append((f"base in {robot.root}", at))
     pairs += [
         ("links", f"{len(robot.link_names)}"),
-        ("collision model", f"{spheres} spheres on {len(robot.spheres)} links, {meshes} convex meshes"),
+        (
+            "collision model",
+            f"{counted(spheres, 'sphere')} on {counted(len(robot.spheres), 'link')}, "
+            f"{counted(meshes, 'convex mesh', 'convex meshes')}",
+        ),
         ("checked pairs of links", f"{len(robot.checked_pairs())}"),
         *(("locked", f"{name} = {value:g}") for name, value in robot.locked.items()),
         *(("note", note) for note in robot.notes),

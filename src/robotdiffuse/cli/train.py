@@ -10,7 +10,7 @@ from typing import Any
 
 from robotdiffuse.cli.arguments import Namespace, chosen
 from robotdiffuse.cli.console import progress
-from robotdiffuse.core.errors import InputError, needs, shown
+from robotdiffuse.core.errors import InputError, counted, needs, shown
 from robotdiffuse.core.output_files import lock_folder, write_atomically
 from robotdiffuse.generation import GenerationSettings, generate
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
@@ -208,8 +208,9 @@ def train_for_robot(
     work = weights_dir.with_name("training") if out is None else Path(out)
     data = data_settings(source, robot, motions, options.get("seed"))
     _check_disk(work, data.trajectories)
-    defaults: dict[str, Any] = {"samples": SAMPLES} if options.get("minutes") is None else {}
-    defaults |= {"encoder": str(work / "encoder")}
+    defaults: dict[str, Any] = {"encoder": str(work / "encoder")}
+    if options.get("minutes") is None:
+        defaults["samples"] = SAMPLES
     settings: PlannerTraining = make_settings(
         defaults | options | {"data": str(work / "data"), "robot": source}
     )
@@ -217,7 +218,7 @@ def train_for_robot(
     if "encoder" in options and settings.encoder is not None and not settings.jointly:
         load_encoder(settings.encoder)
     print(
-        f"{robot.name}: {data.trajectories:,} motions, then training; all in {work}",
+        f"{robot.name}: {counted(data.trajectories, 'motion')}, then training; all in {work}",
         file=sys.stderr,
         flush=True,
     )

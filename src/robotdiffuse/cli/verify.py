@@ -5,7 +5,7 @@ from pathlib import Path
 
 from robotdiffuse.cli.arguments import Namespace
 from robotdiffuse.cli.console import clearances
-from robotdiffuse.core.errors import InputError, joined, located
+from robotdiffuse.core.errors import InputError, counted, joined, located
 from robotdiffuse.core.output_files import check_output
 from robotdiffuse.core.types import NO_PROBLEM, PlanResult, Trajectory, load_result
 from robotdiffuse.core.types import Path as Waypoints
@@ -34,7 +34,10 @@ def run_verify(arguments: Namespace) -> int:
         certificate = certify(problem, list(motions.values())[-1])
         certificate.save(out)
         proof = certificate.proof
-        print(f"wrote {out}: {len(proof.stretches.claim)} stretches, {len(proof.planes)} planes")
+        print(
+            f"wrote {out}: {counted(len(proof.stretches.claim), 'stretch', 'stretches')}, "
+            f"{counted(len(proof.planes), 'plane')}"
+        )
     return 0 if valid else 1
 
 

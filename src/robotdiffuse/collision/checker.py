@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_robot, compile_scene_for, robot_groups
 from robotdiffuse.collision.kernels import collision_cost, lane_clearance, lane_collision
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.types import for_kernels
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -95,7 +95,9 @@ class CollisionChecker:
         """Configurations as float32 for the kernels. They are checked here because compiled code does not
         check its arguments."""
         if q.shape[1] != self.robot.dof:
-            raise InputError(f"q has {q.shape[1]} columns; it must have the {self.robot.dof} planned joints")
+            raise InputError(
+                f"q has {counted(q.shape[1], 'column')}; it must have the {self.robot.dof} planned joints"
+            )
         if not np.isfinite(q).all():
             raise InputError("q holds values that are not finite; configurations must be numbers")
         return for_kernels(q, np.float32)

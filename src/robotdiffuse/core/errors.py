@@ -147,6 +147,12 @@ def joined(names: Iterable[object], most: int = MAX_NAMES) -> str:
     return ", ".join(short_names[:most]) + more
 
 
+def counted(count: Any, noun: str, plural: str | None = None) -> str:
+    """A number and its noun: "1 problem", "2,000 problems". plural: None: the noun with an s."""
+    number = f"{count:,}" if isinstance(count, int) else count
+    return f"{number} {noun if count == 1 else plural or f'{noun}s'}"
+
+
 def repeated(names: Iterable[str]) -> list[str]:
     """The names that appear more than once, in order."""
     return [name for name, count in Counter(names).items() if count > 1]
@@ -350,7 +356,7 @@ def short(value: Any) -> str:
         items = ", ".join(map(short, value))
         return f"({items},)" if len(value) == 1 else f"({items})"
     if isinstance(value, dict):
-        return f"<{len(value)} entries>"
+        return f"<{counted(len(value), 'entry', 'entries')}>"
     return " ".join(repr(value).split())
 
 

@@ -21,6 +21,7 @@ from robotdiffuse.core.errors import (
     MAX_RATE,
     InputError,
     check_type,
+    counted,
     distinct,
     joined,
     located,
@@ -217,7 +218,7 @@ class Path(Value):
         if getattr(self.positions, "ndim", 0) != 2:  # a Path is validated on use, not when it is made
             return one_line(self)
         rows, joints = self.positions.shape
-        return f"Path({joints} joints, {rows} waypoints, {self.length:.3f} rad)"
+        return f"Path({counted(joints, 'joint')}, {counted(rows, 'waypoint')}, {self.length:.3f} rad)"
 
     @property
     def length(self) -> float:
@@ -268,7 +269,10 @@ class Trajectory(Value):
     def __repr__(self) -> str:
         if not isinstance(self.times, ndarray) or self.times.ndim != 1 or not self.times.size:
             return one_line(self)
-        return f"Trajectory({len(self.joint_names)} joints, {len(self.times)} rows, {self.duration:.3g} s)"
+        return (
+            f"Trajectory({counted(len(self.joint_names), 'joint')}, "
+            f"{counted(len(self.times), 'row')}, {self.duration:.3g} s)"
+        )
 
     @property
     def duration(self) -> float:
@@ -612,7 +616,7 @@ class PlanResult:
         planned = f"{self.planner} in {1e3 * self.planning_time:.3g} ms"
         if self.path is None:
             return f"PlanResult({self.status.value}, {planned}: {self.reason})"
-        notes = f", {len(self.notes)} notes" if self.notes else ""
+        notes = f", {counted(len(self.notes), 'note')}" if self.notes else ""
         return f"PlanResult({self.status.value}, {planned}: {self.path!r}, {self.trajectory!r}{notes})"
 
     @property

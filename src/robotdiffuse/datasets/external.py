@@ -20,7 +20,7 @@ from robotdiffuse import __version__
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.core.errors import InputError, numbers, reading, shown
+from robotdiffuse.core.errors import InputError, counted, numbers, reading, shown
 from robotdiffuse.core.input_files import input_file
 from robotdiffuse.core.output_files import check_output, lock_folder, write_atomically
 from robotdiffuse.core.types import Path, Trajectory
@@ -110,7 +110,8 @@ def write_dataset(
     per_path = [scenes] * len(motions) if isinstance(scenes, Scene) else list(scenes)
     if len(per_path) != len(motions) or not all(isinstance(scene, Scene) for scene in per_path):
         raise InputError(
-            f"scenes has {len(per_path)} entries; give one rd.Scene, or one for each of {len(motions)} paths"
+            f"scenes has {counted(len(per_path), 'entry', 'entries')}; give one rd.Scene, or one "
+            f"for each of {len(motions)} paths"
         )
     floor = _shared_floor(per_path)
     slots = max(len(scene.shapes) for scene in per_path) - (floor is not None)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy import ndarray
 
+from robotdiffuse.core.errors import counted
 from robotdiffuse.core.tables import Cell, Column, Figure, Table, plain
 from robotdiffuse.core.types import Configurations
 from robotdiffuse.evaluation.bench_comparisons import (
@@ -106,10 +107,10 @@ def seconds(value: float) -> Cell:
 
 def title(section: Section, comparison: Comparison) -> str:
     """The title of a comparison: problem set, limit and number of problems."""
-    total = "" if comparison.problems == comparison.section_problems else f" of {comparison.section_problems}"
-    plural = "problem" if comparison.problems == 1 else "problems"
+    total = "" if comparison.problems == comparison.section_problems else f"of {comparison.section_problems} "
+    problems = counted(comparison.problems, f"{total}problem")
     seeds = f", {comparison.seeds} seeds each" if comparison.seeds > 1 else ""
-    return f"{section.name}, {comparison.limit:g} s: {comparison.problems}{total} {plural}{seeds}"
+    return f"{section.name}, {comparison.limit:g} s: {problems}{seeds}"
 
 
 def tables(section: Section, comparison: Comparison, reference: str) -> list[Table]:
@@ -238,8 +239,9 @@ def success_over_time(section: Section, planners: Sequence[str]) -> str:
 
 def length_over_time(section: Section, planners: Sequence[str]) -> str:
     """Draw the median ratio of path length to the best known length over time; returns SVG."""
-    label = "joint length / best known"
-    return _over_time(section.curves, planners, label, lambda curve: (curve.times, curve.ratios))
+    return _over_time(
+        section.curves, planners, "joint length / best known", lambda curve: (curve.times, curve.ratios)
+    )
 
 
 def _over_time(
@@ -325,8 +327,11 @@ def about(bench: Bench) -> list[str]:
     dates: dict[str, list[str]] = {}
     for run in bench.sessions:
         versions = ", ".join(f"{name} {version}" for name, version in run["versions"].items())
-        machine = f"{run.get('processor', '?')}, {run.get('cores', '?')} cores"
-        text = f"{machine}, {run.get('workers', '?')} workers; Python {run.get('python', '?')}, {versions}"
+        machine = f"{run.get('processor', '?')}, {counted(run.get('cores', '?'), 'core')}"
+        text = (
+            f"{machine}, {counted(run.get('workers', '?'), 'worker')}; Python "
+            f"{run.get('python', '?')}, {versions}"
+        )
         dates.setdefault(text, []).append(run["date"])
     return [
         f"{days[0] if min(days) == max(days) else f'{min(days)} to {max(days)}'} UTC: {text}"
@@ -341,8 +346,10 @@ def facts(bench: Bench) -> list[str]:
     minutes = sum(record.time for record in records) / 60
     solved = sum(record.solved for record in records)
     return [
-        f"{len(bench.records)} planners, {len(problems):,} problems in {len(bench.problem_sets)} sets",
-        f"{len(records):,} calls in {minutes:.1f} min of planning: {solved:,} verified motions",
+        f"{counted(len(bench.records), 'planner')}, {counted(len(problems), 'problem')} in "
+        f"{counted(len(bench.problem_sets), 'set')}",
+        f"{counted(len(records), 'call')} in {minutes:.1f} min of planning: "
+        f"{counted(solved, 'verified motion')}",
     ]
 
 

@@ -8,7 +8,7 @@ from pathlib import Path as FilePath
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.tables import NO_VALUE, Column, Table, plain
 from robotdiffuse.core.types import Mask
@@ -151,7 +151,7 @@ def facts(data: DataFigures) -> list[tuple[str, str]]:
             f"waypoints, evenly spaced in {'length' if manifest.timing == 'arc' else 'time'}",
             f"{data.trajectories * manifest.waypoints:,}",
         ),
-        (f"in {data.shards:,} shards", f"{data.bytes / 1e6:,.1f} MB"),
+        (f"in {counted(data.shards, 'shard')}", f"{data.bytes / 1e6:,.1f} MB"),
         ("splits", ", ".join(f"{count:,} {name}" for name, count in data.splits.items())),
         ("problems solved", f"{_share(solved)}; tried: {counts['tried']:,}, of these {lost}"),
         (f"keep {distance}, or the clearance of start or goal if smaller", _share(keeps_distance)),
@@ -196,7 +196,7 @@ def tables(data: DataFigures) -> list[Table]:
         figures = [values.mean(dtype=float), *np.quantile(values, list(SPREAD.values()))]
         spreads.append((column.title, *(f"{column.scale * x + 0.0:.3f}" for x in figures)))
     return [
-        Table.pairs(f"{data.manifest.robot}: {data.trajectories:,} motions", facts(data)),
+        Table.pairs(f"{data.manifest.robot}: {counted(data.trajectories, 'motion')}", facts(data)),
         Table.of("", (*columns, *of_shares), families),
         Table.of("", ("", "mean", *SPREAD), spreads),
     ]

@@ -18,7 +18,7 @@ from numpy import ndarray
 
 from robotdiffuse.baselines.controls import NEAREST
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.tables import Column, Table, plain
 from robotdiffuse.core.types import Configurations, Path
 from robotdiffuse.evaluation.bench import BenchSettings, Done, run_bench
@@ -416,7 +416,7 @@ def scores(rows: Sequence[Row], indicators: dict[str, Indicators]) -> dict[str, 
 def _table(section: Section, rows: dict[str, Row]) -> Table:
     """The table of a problem set. `rows` are given by planner."""
     comparison = section.main
-    title = f"Goal: {GOALS[section.problem_set]}; {comparison.problems} problems that are not trivial"
+    title = f"Goal: {GOALS[section.problem_set]}; {counted(comparison.problems, 'nontrivial problem')}"
     indicators = {}
     for planner_row in comparison.rows:
         time = Mean.of(o.record.time for o in planner_row.outcomes).value
@@ -519,8 +519,7 @@ def denoising(problem: Problem) -> list[Noisy]:
         states.append((level / model.schedule.steps, model.hold_ends(x.copy(), reference)))
         return predict(x, level)
 
-    draw = SAMPLERS.load("ddim")
-    x = draw(recorded, model.schedule, lambda: model.draw_noise(1, rng), SHOWN_STEPS, 0.0)
+    x = SAMPLERS.load("ddim")(recorded, model.schedule, lambda: model.draw_noise(1, rng), SHOWN_STEPS, 0.0)
     states.append((0.0, model.hold_ends(x.copy(), reference)))
     motions = []
     for level, state in [*(states[i] for i in SHOWN), states[-1]]:
@@ -599,7 +598,10 @@ def compared_motions(bench: Bench) -> Compared | None:
 
     best = max(keys, key=ratio)
     case = next(case for name in (POSE, JOINT) for case in read_cases(bench.folder, name) if case.key == best)
-    names = case.problem.robot.joint_names
     return Compared(
-        case, {planner: Path(names, by_key[best].waypoints) for planner, by_key in solved.items()}
+        case,
+        {
+            planner: Path(case.problem.robot.joint_names, by_key[best].waypoints)
+            for planner, by_key in solved.items()
+        },
     )

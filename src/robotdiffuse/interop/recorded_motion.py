@@ -16,7 +16,7 @@ import yaml
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, joined, needs, reading, shown
+from robotdiffuse.core.errors import InputError, counted, joined, needs, reading, shown
 from robotdiffuse.core.input_files import MAX_YAML_SIZE, parse_yaml, read_json, read_text
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.types import (
@@ -219,8 +219,13 @@ def read_yaml(file: FilePath, topic: str | None = None) -> RecordedMotion:
 
 def write_yaml(problem: Problem, trajectory: Trajectory, file: FilePath) -> None:
     """Write a JointTrajectory as `ros2 topic pub` takes it; see `interop.write_motion`."""
-    record = joint_trajectory(trajectory)
-    text = yaml.dump(record, Dumper=yaml.CSafeDumper, sort_keys=False, default_flow_style=None, width=110)
+    text = yaml.dump(
+        joint_trajectory(trajectory),
+        Dumper=yaml.CSafeDumper,
+        sort_keys=False,
+        default_flow_style=None,
+        width=110,
+    )
     write_atomically(file, text)
 
 
@@ -268,7 +273,9 @@ def _only(trajectories: Any) -> RecordedMotion:
     if isinstance(trajectories, Mapping):
         return _motion(trajectories)
     if not isinstance(trajectories, list) or len(trajectories) != 1:
-        count = f"has {len(trajectories)} parts" if isinstance(trajectories, list) else "is no list"
+        count = (
+            f"has {counted(len(trajectories), 'part')}" if isinstance(trajectories, list) else "is no list"
+        )
         raise InputError(f"trajectory {count}; it must be a trajectory, or a list of one")
     return _motion(trajectories[0])
 
@@ -349,7 +356,7 @@ def _table(text: str) -> RecordedMotion:
     columns: list[list[float]] = [[] for _ in header]
     for number, row in rows[1:]:
         if len(row) != len(header):
-            raise InputError(f"line {number} has {len(row)} cells; the header has {len(header)}")
+            raise InputError(f"line {number} has {counted(len(row), 'cell')}; the header has {len(header)}")
         for name, column, cell in zip(header, columns, row, strict=True):
             try:
                 column.append(float(cell))

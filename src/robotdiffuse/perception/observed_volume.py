@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32, UInt8
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Configuration
 from robotdiffuse.perception.depth_filter import empty_regions, filtered, grown_for_errors, open_depth
@@ -548,7 +548,10 @@ def _observed(view: DepthView, robot: Robot, start: Configuration) -> ObservedVo
     """The volume observed by one view."""
     q = start if view.configuration is None else view.configuration
     if len(q) != robot.dof:
-        raise InputError(f"the configuration has {len(q)} numbers; {robot.name} plans {robot.dof} joints")
+        raise InputError(
+            f"the configuration has {counted(len(q), 'number')}; {robot.name} plans "
+            f"{counted(robot.dof, 'joint')}"
+        )
     state, behind, counts = carve_view(view, robot, q, COARSE)
     occupied = counts > 0
     behind[(state != BEHIND) | occupied] = 0.0

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from robotdiffuse.core.errors import (
     InputError,
     check_type,
+    counted,
     located,
     numbers,
     rigid_transform,
@@ -230,7 +231,9 @@ def plan_steps(
         None if a later step fails; `furthest` then holds the failure that came after the most steps."""
         nonlocal furthest, tried_ends
         if k == len(steps):
-            return StepsResult(tuple(steps), results, space, f"solved in {k} steps", clock() - began)
+            return StepsResult(
+                tuple(steps), results, space, f"solved in {counted(k, 'step')}", clock() - began
+            )
         step = steps[k]
         where = f"step {k + 1} of {len(steps)}, {step.name}"
         if isinstance(step, Attach | Detach):

@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from robotdiffuse.core.errors import InputError, check_name, check_type, located, shown
+from robotdiffuse.core.errors import InputError, check_name, check_type, counted, located, shown
 from robotdiffuse.core.input_files import (
     file_name,
     known_ending,
@@ -95,7 +95,9 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
     if file.suffix.lower() == ".jsonl":
         lines = _lines(text)
         if not 0 <= index < len(lines):
-            raise InputError(f"index is {index}; {file} holds {len(lines)} problems, counted from 0")
+            raise InputError(
+                f"index is {index}; {file} holds {counted(len(lines), 'problem')}, counted from 0"
+            )
         return _problem_of_line(file, *lines[index], ignore_joints)
     if index != 0:
         raise InputError(f"index is {index}; {file} holds one problem, and only .jsonl files hold more")

@@ -23,6 +23,7 @@ from robotdiffuse.core.errors import (
     check_list,
     check_name,
     check_type,
+    counted,
     distinct,
     numbers,
     repeated,
@@ -230,8 +231,8 @@ def depth_views(robot: Robot, views: Any) -> tuple[DepthView, ...]:
     for i, view in enumerate(views):
         if view.configuration is not None and len(view.configuration) != robot.dof:
             raise InputError(
-                f"views[{i}].configuration has {len(view.configuration)} values; {robot.name} has "
-                f"{robot.dof} planned joints: {', '.join(robot.joint_names)}"
+                f"views[{i}].configuration has {counted(len(view.configuration), 'value')}; {robot.name} has "
+                f"{counted(robot.dof, 'planned joint')}: {', '.join(robot.joint_names)}"
             )
     return tuple(views)
 
@@ -301,7 +302,8 @@ def velocity_at_start(robot: Robot, value: object, notes: list[str]) -> JointVal
     names = ", ".join(robot.joint_names)
     if velocity is None or velocity.shape != (robot.dof,) or not np.isfinite(velocity).all():
         raise InputError(
-            f"start_velocity is {shown(value)}; it must be {robot.dof} finite numbers [rad/s]: {names}"
+            f"start_velocity is {shown(value)}; it must be {counted(robot.dof, 'finite number')} "
+            f"[rad/s]: {names}"
         )
     within = np.clip(velocity, -robot.velocity, robot.velocity)
     for j in np.flatnonzero((velocity != within) & (robot.velocity > 0)):
@@ -371,9 +373,14 @@ def configuration(robot: Robot, field: str, value: object) -> Configuration:
     q = numbers(_values(robot, field, value))
     names = ", ".join(robot.joint_names)
     if q is None or q.ndim != 1:
-        raise InputError(f"{field} is {shown(value)}; it must be a list of {robot.dof} numbers: {names}")
+        raise InputError(
+            f"{field} is {shown(value)}; it must be a list of {counted(robot.dof, 'number')}: {names}"
+        )
     if len(q) != robot.dof:
-        raise InputError(f"{field} has {len(q)} values; {robot.name} has {robot.dof} planned joints: {names}")
+        raise InputError(
+            f"{field} has {counted(len(q), 'value')}; {robot.name} has "
+            f"{counted(robot.dof, 'planned joint')}: {names}"
+        )
     return q
 
 

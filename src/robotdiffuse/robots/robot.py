@@ -18,6 +18,7 @@ from robotdiffuse.core.errors import (
     MAX_COORDINATE,
     InputError,
     check_name,
+    counted,
     numbers,
     shown,
     unknown_name,
@@ -455,7 +456,10 @@ class Robot(KinematicTree):
         return self.__dict__.get("_unlocked", self)
 
     def __repr__(self) -> str:
-        return f"Robot({self.name!r}, {self.dof} planned joints, {self.base} to {' and '.join(self.tips)})"
+        return (
+            f"Robot({self.name!r}, {counted(self.dof, 'planned joint')}, {self.base} to "
+            f"{' and '.join(self.tips)})"
+        )
 
     def __str__(self) -> str:
         def row(values: ndarray) -> str:
@@ -466,15 +470,16 @@ class Robot(KinematicTree):
         locked_text = ", ".join(f"{name} = {value:g}" for name, value in list(self.locked.items())[:6])
         more = f" and {len(self.locked) - 6} more" if len(self.locked) > 6 else ""
         lines = [
-            f"Robot {self.name!r}: {self.dof} planned joints from {self.base} to {' and '.join(self.tips)}",
+            f"Robot {self.name!r}: {counted(self.dof, 'planned joint')} from {self.base} to "
+            f"{' and '.join(self.tips)}",
             f"  joints  {joints}",
             f"  lower   {row(self.lower)}",
             f"  upper   {row(self.upper)}",
             f"  locked  {locked_text}{more}" if locked_text else "",
-            f"  {spheres} spheres on {len(self.spheres)} of {len(self.link_names)} links, "
-            f"{len(self.checked_pairs())} checked pairs of links",
+            f"  {counted(spheres, 'sphere')} on {len(self.spheres)} of {len(self.link_names)} links, "
+            f"{counted(len(self.checked_pairs()), 'checked pair')} of links",
             f"  holds   {', '.join(body.name for body in self.attached)}" if self.attached else "",
-            f"  {len(self.notes)} notes: robot.notes" if self.notes else "",
+            f"  {counted(len(self.notes), 'note')}: robot.notes" if self.notes else "",
         ]
         return "\n".join(line for line in lines if line)
 
@@ -570,7 +575,9 @@ def configurations(robot: Robot, q: ArrayLike) -> ndarray:
     rows = numbers(q)
     if rows is None or rows.ndim not in (1, 2) or rows.shape[-1] != robot.dof or not within(rows):
         names = ", ".join(robot.joint_names)
-        raise InputError(f"q is {shown(q)}; it must be {robot.dof} numbers, or rows of them: {names}")
+        raise InputError(
+            f"q is {shown(q)}; it must be {counted(robot.dof, 'number')}, or rows of them: {names}"
+        )
     return rows
 
 
@@ -582,7 +589,7 @@ def named_pose(robot: Robot, field: str, name: str) -> list[float]:
     """
     complete = [pose for pose, values in robot.poses.items() if {*robot.joint_names} <= values.keys()]
     if not complete:
-        expected = f"a list of {robot.dof} numbers: {', '.join(robot.joint_names)}"
+        expected = f"a list of {counted(robot.dof, 'number')}: {', '.join(robot.joint_names)}"
         raise InputError(
             f"{field} is {shown(name)}; it must be {expected} ({robot.name} has no named pose with values "
             "for all planned joints)"

@@ -8,7 +8,7 @@ from typing import Any, no_type_check
 
 import numpy as np
 
-from robotdiffuse.core.errors import InputError, check_name, joined, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, counted, joined, shown, unknown_name
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation, transform
 from robotdiffuse.core.types import Configuration, Pose, Value
 from robotdiffuse.robots.robot import Robot
@@ -81,7 +81,7 @@ class Scene(Value):
         object.__setattr__(self, "allowed_contacts", _contacts(allowed_contacts, names_of, names_in_use))
 
     def __repr__(self) -> str:
-        count = f"{len(self.shapes)} shape" + ("" if len(self.shapes) == 1 else "s")
+        count = counted(len(self.shapes), "shape")
         names = joined((shape.name for shape in self.shapes), SHOWN_NAMES)
         return f"Scene({count}: {names})" if names else f"Scene({count})"
 

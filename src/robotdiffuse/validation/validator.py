@@ -15,7 +15,16 @@ from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import describe_contact
 from robotdiffuse.collision.motions import Contact, ContinuousCollision
-from robotdiffuse.core.errors import MAX_COORDINATE, InputError, check_type, distinct, joined, shown, within
+from robotdiffuse.core.errors import (
+    MAX_COORDINATE,
+    InputError,
+    check_type,
+    counted,
+    distinct,
+    joined,
+    shown,
+    within,
+)
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import ROWS, Path, Trajectory, for_kernels
 from robotdiffuse.problems.problem import Problem, check_problem
@@ -373,7 +382,8 @@ class Verifier:
             return None
         at = float(clock[row_indices[sharp[settings.reversals] + 1]])
         message = (
-            f"the motion twitches: {len(sharp)} sharp reversals; at most {settings.reversals} are allowed"
+            f"the motion twitches: {counted(len(sharp), 'sharp reversal')}; at most "
+            f"{settings.reversals} are allowed"
         )
         return Violation("twitch", at, message, None, None, float(len(sharp) - settings.reversals))
 

@@ -15,7 +15,7 @@ from numpy import ndarray
 from numpy.random import Generator
 from torch import Tensor
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.types import Mask, Values
 from robotdiffuse.datasets.shards import SPLITS, read_rows, shard_indices, turns_about_vertical
@@ -149,7 +149,10 @@ def load_data(
             )
             count += int(chosen.sum())
         if rows.turn == turned_copies:
-            report(f"data: {len(fingerprints)} of {shards} shards, {count:,} trajectories")
+            report(
+                f"data: {len(fingerprints)} of {shards} shards, "
+                f"{counted(count, 'trajectory', 'trajectories')}"
+            )
     q, scenes, trivial, embeddings = zip(*parts["train"], *parts["validation"], strict=True)
     return TrajectoryData(
         np.concatenate(q),

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
-from robotdiffuse.core.errors import InputError, check_type, vector
+from robotdiffuse.core.errors import InputError, check_type, counted, vector
 from robotdiffuse.core.locked import locked
 from robotdiffuse.core.settings import Natural, converted
 from robotdiffuse.core.types import FIRST, Configuration, Configurations, Path, PlanResult, Status, Trajectory
@@ -348,7 +348,7 @@ class Explorer:
         if not self.cameras:
             return Step(STUCK, f"{why}; no camera is on the arm to look with", policy)
         if self._views_taken >= self.settings.max_views:
-            return Step(STUCK, f"{why}, after {self._views_taken} views", policy)
+            return Step(STUCK, f"{why}, after {counted(self._views_taken, 'view')}", policy)
         path = motion.path
         tentative, to_view = self._least_unseen(problem) if path is None else (motion, self.wanted(path))
         if tentative.path is None:
@@ -460,8 +460,9 @@ class Explorer:
         ends = near_ends(self.map, (as_seen.start, *goals))
         not_shown = self._looked_for & self.map.unknown
         blocked = surface((self.map.occupied | not_shown) & ~ends)
-        name = "occupied, or looked for in vain"
-        avoided = cover(self.map, self.scene, MAP.centers(blocked), MAP.edge, name)
+        avoided = cover(
+            self.map, self.scene, MAP.centers(blocked), MAP.edge, "occupied, or looked for in vain"
+        )
         avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
         results = list[tuple[PlanResult, Voxels]]()
         for seed in range(self._seed, self._seed + TENTATIVE_MOTIONS):

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, check_type
+from robotdiffuse.core.errors import InputError, check_type, counted
 from robotdiffuse.core.types import ROWS, Path, PlanResult, Status, Trajectory, for_kernels
 from robotdiffuse.planning.context import (
     MIN_TIME_LIMIT,
@@ -240,7 +240,7 @@ def join(
         if result.problem.waypoints:
             raise InputError(f"results[{i}] has waypoints; join motions without them")
     if len(results) < 2:
-        raise InputError(f"results has {len(results)} results; it takes two to join")
+        raise InputError(f"results has {counted(len(results), 'result')}; it takes two to join")
     problems = [result.problem for result in results]
     first = problems[0]
     shared = [
@@ -298,8 +298,8 @@ def plan_from_start_velocity(planner: Solver, problem: Problem, request: PlanReq
     stop = problem.start + stopping_distance(robot, context.timing, velocity) * direction
     beyond = np.flatnonzero(((stop < robot.lower) | (stop > robot.upper)) & ~np.array(robot.continuous))
     if len(beyond):
-        name = robot.joint_names[int(beyond[0])]
-        return context.fail(Status.INVALID_START, f"{name} cannot stop from start_velocity within its limits")
+        reason = f"{robot.joint_names[beyond[0]]} cannot stop from start_velocity within its limits"
+        return context.fail(Status.INVALID_START, reason)
     result = planner.attempt(replace(problem, start=stop, start_velocity=None), request)
     if result.path is None:
         return replace(result, reason=f"from where the arm can stop: {result.reason}")

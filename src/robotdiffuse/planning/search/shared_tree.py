@@ -447,7 +447,7 @@ class SharedTreeRRTStar(Planner[SharedTreeSettings]):
                 break
             reached = int(np.isfinite(search.goal_costs).sum())
             reason = (
-                f"solved by {self.name}: {len(search.costs)} rounds, {reached} of {len(search.goals)} goals "
+                f"solved by {self.name}: round {len(search.costs)}, {reached} of {len(search.goals)} goals "
                 f"reached, {100 * search.safety_distance:.0f} cm of safety distance, except near start and "
                 "goal"
             )
