@@ -282,6 +282,7 @@ def test_other_problems_of_the_same_name_are_refused(tmp_path: Path) -> None:
     with pytest.raises(rd.InputError, match=r"problems called mine that were read from .*; those in .* another content"):
         gather_cases([other], None, tmp_path / "out", quiet)
     (tmp_path / "rop.jsonl").write_text(lines[0])
+    refuses("a is an input of this command", gather_cases, [str(tmp_path / "a")], None, tmp_path / "a", quiet)
     refuses("have the name of the family rop", gather_cases, [str(tmp_path / "rop.jsonl")], None, tmp_path / "out", quiet)
 
 

@@ -145,6 +145,7 @@ def test_bad_input(tmp_path: Path, said: Said) -> None:
     assert "known: " in said(2, *base, "--rows", "Ourz")
     assert "known: cabinet, clutter, crate" in said(2, *base, "--family", "ropp")
     assert "no data set" in said(2, *base)
+    assert "is an input of this command" in said(2, *base[:-1], tmp_path)
     for part in ("table1", "figures"):
         options = ("--out", tmp_path / "out", "--workers", "2", "--cluster", "ray")
         assert "--workers cannot be combined with --cluster" in said(2, "reproduce", part, *options)

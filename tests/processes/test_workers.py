@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from helpers import waiting
+from helpers.refusals import refuses
 from robotdiffuse.processes import workers as module
 from robotdiffuse.processes.workers import EndedError, OverrunError, Worker, Workers, allow, cancelled, renew
 
@@ -65,6 +66,31 @@ def test_closing_waits_for_a_process_that_is_starting(worker: Worker, monkeypatc
         assert not Path(f"/proc/{pids[0]}").exists()
         with pytest.raises(EndedError, match="closed"):
             sent.result(HELD)
+
+
+def test_too_many_workers_are_refused() -> None:
+    """Regression: 100,000 workers started as many threads or processes."""
+    refuses("workers is 100000; it must be at most 1024", Workers, 100_000)
+
+
+LOCKED = """
+import multiprocessing
+from robotdiffuse.processes.workers import Worker
+kept = []
+def lock():
+    kept.append(multiprocessing.RLock())
+if __name__ == "__main__":
+    worker = Worker()
+    worker.call(lock)
+    worker.close()
+"""
+
+
+def test_an_ended_worker_leaves_no_locks(tmp_path: Path) -> None:
+    """Regression: at the end of `reproduce table2`, Python warned of a leaked semaphore, the lock of tqdm."""
+    (tmp_path / "script.py").write_text(LOCKED)
+    ended = subprocess.run([sys.executable, tmp_path / "script.py"], capture_output=True, text=True, check=True)
+    assert not ended.stderr
 
 
 def wait_until_cancelled() -> None:

@@ -21,8 +21,8 @@ from robotdiffuse.baselines.controls import (
     VIAS,
     ControlSettings,
 )
-from robotdiffuse.core.errors import InputError, check_name
-from robotdiffuse.core.output_files import lock_folder
+from robotdiffuse.core.errors import InputError, check_name, counted
+from robotdiffuse.core.output_files import check_not_input, lock_folder
 from robotdiffuse.core.settings import Count, OneOf, Settings
 from robotdiffuse.core.tables import Column, Figure, Table
 from robotdiffuse.core.types import Values
@@ -172,25 +172,27 @@ def run_ablation(
     """Train the networks of the rows and evaluate every row. After an interruption, the same call continues
     the work.
 
-    Raises InputError for an unknown row, listing the known ones, and for data of another robot.
+    Raises InputError for an unknown row, listing the known ones, for data of another robot, and if `out` is
+    the folder of the data.
     """
     for name in rows:
         check_name("row of Table 2", name, ROWS)
-    read_manifest(settings.data).check_robot(load_robot("panda"))
     out = FilePath(settings.out)
+    check_not_input(out, settings.data)
+    read_manifest(settings.data).check_robot(load_robot("panda"))
     configs = dict.fromkeys(ROWS[name].config for name in rows)
     trainings = [Training(config, seed) for config in configs for seed in range(settings.seeds)]
     evaluations: dict[tuple[Training | str, bool], Evaluation] = {}
     with lock_folder(out), Workers(workers, patience=STOP_TIMEOUT) as pool:
         if not (out / ENCODER / "encoder.json").exists():
-            report(f"training {ENCODER}: {settings.encoder_samples:,} clouds")
+            report(f"training {ENCODER}: {counted(settings.encoder_samples, 'cloud')}")
             encoder = EncoderTraining(name=ENCODER, minutes=None, samples=settings.encoder_samples)
             train_encoder(encoder, str(out / ENCODER))
         _training(out / ENCODER / "encoder.json", "encoder_samples", settings.encoder_samples)
         digests = {}
         for _, training in pool.each(_train, [(settings, training) for training in trainings]):
-            about = _training(out / training.folder / "model.json", "samples", settings.samples)
-            digests[training.folder] = about["data"]
+            file = out / training.folder / "model.json"
+            digests[training.folder] = _training(file, "samples", settings.samples)["data"]
             report(f"trained {training.folder}")
         if len(set(digests.values())) > 1:
             digests_text = ", ".join(f"{name} {digest}" for name, digest in digests.items())
@@ -205,8 +207,8 @@ def run_ablation(
             _, row_training, guided, _ = todo[number]
             evaluations[row_training, guided] = evaluation
             name = row_training if isinstance(row_training, str) else row_training.folder
-            guidance = "with" if guided else "without"
-            report(f"evaluated {name} {guidance} guidance: {100 * evaluation.single.mean():.1f} % of samples")
+            text = f"evaluated {name} {'with' if guided else 'without'} guidance"
+            report(f"{text}: {100 * evaluation.single.mean():.1f} % of samples")
     results = []
     for name in rows:
         row = ROWS[name]
@@ -377,7 +379,8 @@ def straight_line_table(problems: int) -> Table:
     columns = ("row", Column("success", "%"))
     rows.sort(key=lambda row: row[1].value)
     return Table.of(
-        f"The straight line, without a planner, beside the paper's rows: {problems} sampled problems",
+        f"The straight line, without a planner, beside the paper's rows: "
+        f"{counted(problems, 'sampled problem')}",
         columns,
         rows,
         LINE_NOTES,

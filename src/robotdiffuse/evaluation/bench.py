@@ -257,10 +257,9 @@ def on_this_machine(settings: "BenchSettings", runs: Sequence[Run], session: str
     the machine affects all of them alike.
     """
     first = {run.method: run for run in reversed(runs)}
-    specs = settings.specs
     workers = settings.workers
     planners = {
-        label: PlannerProcess(specs[label], _log_file(settings.logs, label), settings.cpu_time)
+        label: PlannerProcess(settings.specs[label], _log_file(settings.logs, label), settings.cpu_time)
         for label in first
     }
     pool = ThreadPoolExecutor(workers)
@@ -309,8 +308,10 @@ def on_cluster(settings: "BenchSettings", runs: Sequence[Run], session: str) -> 
 def records_of(run: Run, answers: Sequence[Fields], about: Fields) -> list[Record]:
     """The records of a run: one of the first call and, if there were restarts, one of all calls together."""
     labels = (run.method, run.method + RESTARTED)
-    pairs = zip(labels, answers, strict=False)
-    return [run.record({"planner": label, **about, **answer}) for label, answer in pairs]
+    return [
+        run.record({"planner": label, **about, **answer})
+        for label, answer in zip(labels, answers, strict=False)
+    ]
 
 
 def _log_file(logs: FilePath, label: str) -> FilePath:
@@ -413,8 +414,9 @@ def run_bench(settings: BenchSettings, report: Progress, done: Done) -> int:
         total = len(cases) * settings.seeds * len(specs)
         done(total - len(todo), total)
         make = on_this_machine if settings.cluster is None else on_cluster
-        results = make(settings, todo, session)
-        return keep_records(todo, results, files, lambda left: done(total - left, total))
+        return keep_records(
+            todo, make(settings, todo, session), files, lambda left: done(total - left, total)
+        )
 
 
 def open_runs(
@@ -442,10 +444,8 @@ def _check_weights(settings: BenchSettings, sessions: Sequence[Mapping[str, Any]
     """Raise InputError if a planner of the same name was run in this folder with other weights: records of
     different weights would be mixed."""
     for label, spec in settings.specs.items():
-        recorded_hashes = [
-            session["weights"][label] for session in sessions if label in session.get("weights", {})
-        ]
-        if any(hashes != spec.weights_hashes for hashes in recorded_hashes):
+        now = spec.weights_hashes
+        if any(session.get("weights", {}).get(label, now) != now for session in sessions):
             raise InputError(
                 f"{settings.out} has records of {label} with other weights than those in {spec.weights}; "
                 "rename the folder of the weights, or use another folder for the results"
@@ -569,8 +569,9 @@ def preset_settings(
     check_name("preset", preset, PRESETS)
     chosen = PRESETS[preset]
     preset_values = {"count": min(count or chosen.count, chosen.count), "equal_time": chosen.equal_time}
-    sets = (*chosen.problems, *problems)
     return [
-        BenchSettings(chosen.planners, sets, out, time_limit=limit, **preset_values, **more)
+        BenchSettings(
+            chosen.planners, (*chosen.problems, *problems), out, time_limit=limit, **preset_values, **more
+        )
         for limit in chosen.limits
     ]

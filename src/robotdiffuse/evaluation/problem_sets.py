@@ -9,7 +9,7 @@ from pathlib import Path as FilePath
 
 from robotdiffuse.core.errors import InputError, repeated
 from robotdiffuse.core.input_files import read_bytes, read_json
-from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.output_files import check_not_input, write_atomically
 from robotdiffuse.core.types import LENGTH, Path
 from robotdiffuse.planning.search.rrt import AORRTC, AORRTCSettings
 from robotdiffuse.problems.families import FAMILIES
@@ -76,8 +76,8 @@ def gather_cases(names: list[str], count: int | None, out: FilePath, report: Pro
 
     Problems are stored in `out`/problems, one file for each set, and read from there next time. If `count` is
     then larger, problems of families are added. `report` is called with lines of text about the progress.
-    Raises InputError for unknown and repeated names, for empty sets, and if a file or folder has another
-    content than the problems that are stored under its name.
+    Raises InputError for unknown and repeated names, for empty sets, for `out` as a set, and if a file or
+    folder has another content than the problems that are stored under its name.
     """
     repeated_names = repeated(problem_set_name(text) for text in names)
     if repeated_names:
@@ -96,14 +96,12 @@ def read_cases(out: FilePath, problem_set: str) -> list[Case]:
 def _set(text: str, count: int | None, folder: FilePath, report: Progress) -> list[Case]:
     name = problem_set_name(text)
     family = text.removesuffix(NONTRIVIAL_SUFFIX)
+    case_store = case_file(folder, family if family in FAMILIES else name)
     if family in FAMILIES:
-        finder = search if text.endswith(NONTRIVIAL_SUFFIX) else None
-        case_count = 100 if count is None else count
-        return _of_set(
-            case_file(folder, family).held_out(family, case_count, validator, finder, report), name
-        )
-    case_store = case_file(folder, name)
+        finder = search if family != text else None
+        return _of_set(case_store.held_out(family, count or 100, validator, finder, report), name)
     place = FilePath(text)
+    check_not_input(folder.parent, text)
     source = folder / f"{name}.source.json"
     about = {"source": str(place.resolve()), "sha256": _content_hash(place)}
     if not len(case_store):

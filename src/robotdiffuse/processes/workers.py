@@ -42,6 +42,8 @@ CHECK_INTERVAL = 0.05
 """Time between two checks whether a call takes too long or is cancelled [s]."""
 RESTART_DELAY = 1.0
 """Time between two attempts to start a worker that is kept ready [s]."""
+MAX_WORKERS = 1024
+"""Largest number of worker processes."""
 RERUN_HINT = "run the same command again"
 GUARD = 'if __name__ == "__main__":'
 # fresh interpreters: forked ones could inherit locks of running threads
@@ -285,7 +287,11 @@ class Workers:
         keep_ready: bool = False,
     ) -> None:
         """count: processes; 0: `each` runs the calls in this process. prepare, arguments: see `Worker`.
-        patience: time from SIGTERM to SIGKILL [s]. keep_ready: start processes before calls need them."""
+        patience: time from SIGTERM to SIGKILL [s]. keep_ready: start processes before calls need them.
+
+        Raises InputError for more than MAX_WORKERS processes."""
+        if count > MAX_WORKERS:
+            raise InputError(f"workers is {count}; it must be at most {MAX_WORKERS}")
         if count:
             check_not_importing()
         self.workers = [Worker(prepare, arguments) for _ in range(count)]
@@ -468,6 +474,9 @@ _this: _Process | None = None
 def _main(connection: Connection) -> None:
     global _this
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    # as in other processes: locks of packages, such as tqdm, then leave nothing behind that Python would warn
+    # of when this process is ended
+    multiprocessing.set_start_method(None, force=True)
     _exit_by_signal_with_parent()
     _this = _Process(connection)
     threading.Thread(target=_this.receive, daemon=True).start()

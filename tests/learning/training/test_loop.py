@@ -27,6 +27,15 @@ def test_losses_that_are_not_finite_are_skipped(tmp_path: Path) -> None:
     refuses("not finite", run_of(tmp_path / "hopeless", lambda call: float("nan")).loop)
 
 
+def test_steps_that_are_not_finite_are_counted_beyond_an_interruption(tmp_path: Path) -> None:
+    """Regression: a resumed run counted anew, so that it ended later than an uninterrupted one, or never."""
+    run = run_of(tmp_path, lambda call: float("nan"))
+    run.step()
+    run.step()
+    run.save()
+    refuses("not finite at step 3", run_of(tmp_path, lambda call: float("nan")).step)
+
+
 def test_a_short_training_that_diverged_writes_no_weights(tmp_path: Path) -> None:
     settings = EncoderTraining(minutes=None, samples=3, batch=1)
     task = ToyTask(settings, lambda call: float("nan") if call > 1 else 1.0)

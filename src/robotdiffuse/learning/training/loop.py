@@ -32,7 +32,7 @@ from torch.nn.utils import clip_grad_norm_, parameters_to_vector, vector_to_para
 from torch.optim.swa_utils import AveragedModel
 
 from robotdiffuse import __version__
-from robotdiffuse.core.errors import InputError, needs, reading
+from robotdiffuse.core.errors import InputError, counted, needs, reading
 from robotdiffuse.core.interrupts import handled
 from robotdiffuse.core.output_files import lock_folder, write_atomically
 from robotdiffuse.learning import need_packages
@@ -202,6 +202,8 @@ class Position:
     seconds: float = 0.0
     skipped: int = 0
     """Number of steps that were skipped because loss or gradient was not finite."""
+    bad: int = 0
+    """Number of the last of them without a good step between."""
 
 
 class TrainingRun:
@@ -238,7 +240,6 @@ class TrainingRun:
         self.identity = task.identity | ({} if processes.count == 1 else {"processes": str(processes.count)})
         self.rows: list[dict[str, float | int | str]] = []
         self._losses: list[float] = []
-        self._bad = 0
         self._file = self.out / "training.safetensors"
         if self._file.is_file():
             self._restore()
@@ -299,12 +300,12 @@ class TrainingRun:
         self.at.step += 1
         self.at.samples += self._samples_per_step
         if not (math.isfinite(mean) and math.isfinite(norm.item())):
-            self._bad += 1
+            self.at.bad += 1
             self.at.skipped += 1
-            if self._bad == self.settings.bad_steps:
+            if self.at.bad == self.settings.bad_steps:
                 self.diverged()
             return
-        self._bad = 0
+        self.at.bad = 0
         self.optimizer.step()
         self._losses.append(mean)
         self.average.update_parameters(self.parameters)
@@ -376,10 +377,10 @@ class TrainingRun:
         success = validation.success
         free_share = "" if success is None or math.isnan(success) else f"{success:.1%} of samples free, "
         console.print(
-            f"{self.task.title}: {self.fraction:.1%}, {self.at.samples:,} samples in "
+            f"{self.task.title}: {self.fraction:.1%}, {counted(self.at.samples, 'sample')} in "
             f"{self.at.seconds / 60:.1f} min, loss {self.rows[-1]['loss']:.4f}, "
             f"validation {validation.loss:.4f}, {free_share}"
-            f"{self.at.skipped} steps skipped",
+            f"{counted(self.at.skipped, 'step')} skipped",
             highlight=False,
             soft_wrap=True,
         )
