@@ -71,7 +71,7 @@ def test_the_same_data_with_more_workers_and_after_an_interruption(folder: Path,
     half = tmp_path / ".shard_00002.zarr.abc" / "new"
     half.mkdir(parents=True)
     (half / "zarr.json").write_text("{")
-    (tmp_path / ".manifest.json.77").write_text("{")
+    (tmp_path / ".manifest.json.0123456789abcdef.tmp").write_text("{")
     seen: list[tuple[int, int]] = []
     assert generate(SETTINGS, tmp_path, 2, progress=lambda *at: seen.append(at)) == 12
     assert seen == [(4, 12), (8, 12), (12, 12)]

@@ -176,8 +176,9 @@ class JsonLines:
 
 @contextmanager
 def lock_folder(out: Path) -> Iterator[None]:
-    """Make the folder, and lock it during the block. The lock is also released if the process is killed. At
-    the end of the block, folders that were made here and are still empty are removed.
+    """Make the folder, and lock it during the block. The lock is also released if the process is killed.
+    Temporary files that a killed process left (see `write_atomically`) are removed. At the end of the block,
+    folders that were made here and are still empty are removed.
 
     Raises InputError if another process holds the lock or the folder cannot be made or written into.
     """
@@ -196,6 +197,8 @@ def lock_folder(out: Path) -> Iterator[None]:
             raise InputError(f"another process is filling {out}; wait for it") from None
         except OSError:
             pass  # this file system has no locks
+        for leftover in out.glob(f".*.{'[0-9a-f]' * 16}.tmp"):
+            leftover.unlink(missing_ok=True)
         yield
     finally:
         os.close(folder)

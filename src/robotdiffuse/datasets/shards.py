@@ -247,11 +247,9 @@ def existing_shards(folder: str | FilePath) -> list[int]:
 
 
 def remove_leftovers(folder: str | FilePath) -> None:
-    """Remove incomplete files of killed runs. Call it only while no process writes to the folder."""
+    """Remove incomplete shards of killed runs. Call it only while no process writes to the folder."""
     for path in FilePath(folder).glob(".shard_*.zarr.*"):
         shutil.rmtree(path, ignore_errors=True)
-    for path in FilePath(folder).glob(f".{MANIFEST}.*"):
-        path.unlink(missing_ok=True)
 
 
 def _zarr() -> ModuleType:

@@ -36,6 +36,13 @@ def test_steps_that_are_not_finite_are_counted_beyond_an_interruption(tmp_path: 
     refuses("not finite at step 3", run_of(tmp_path, lambda call: float("nan")).step)
 
 
+def test_a_checkpoint_that_a_killed_run_left_half_written_is_removed(tmp_path: Path) -> None:
+    """Regression: each kill while a checkpoint was written left a file of its size for ever."""
+    (tmp_path / ".training.safetensors.0123456789abcdef.tmp").write_bytes(b"half")
+    run_of(tmp_path, lambda call: 1.0).loop()
+    assert not list(tmp_path.glob(".*"))
+
+
 def test_a_short_training_that_diverged_writes_no_weights(tmp_path: Path) -> None:
     settings = EncoderTraining(minutes=None, samples=3, batch=1)
     task = ToyTask(settings, lambda call: float("nan") if call > 1 else 1.0)
