@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 
 import robotdiffuse as rd
 from helpers.refusals import refuses
@@ -134,19 +135,25 @@ def test_bad_input() -> None:
     refuses("pose is .*; it must be a homogeneous", planner().update_attached_box, [0.1] * 3, np.zeros((4, 4)))
     refuses("qpos is .*; it must be 9 numbers", planner().plan_pose, [0.5, 0, 0.4, *DOWN], QPOS[:8])
     refuses("qpos is 'ready'; it must be 9 numbers", planner().plan_pose, [0.5, 0, 0.4, *DOWN], "ready")
-    refuses("qpos is .*nan.*; it must be 9 numbers", planner().plan_pose, [0.5, 0, 0.4, *DOWN], np.full(9, np.nan))
+    for size in (7, 9):
+        refuses("qpos is .*nan.*; it must be 9 numbers", planner().plan_pose, [0.5, 0, 0.4, *DOWN], np.full(size, np.nan))
     refuses("unknown option 'tim_step'.*did you mean time_step", planner().plan_pose, [0.5, 0, 0.4, *DOWN], QPOS, tim_step=1)
+    for call, goal in ((planner().plan_pose, POSE), (planner().plan_screw, POSE), (planner().plan_qpos, [QPOS])):
+        refuses("planning_time is -1; it must be a number from", call, goal, QPOS, planning_time=-1)
     refuses("unknown option 'constraint_function'", planner().plan_qpos, [QPOS], QPOS, constraint_function=print)
     refuses("time_step is 0; it must be", planner().plan_pose, [0.5, 0, 0.4, *DOWN], QPOS, time_step=0)
     refuses("goal_qposes is .*; it must be rows of 9 numbers", planner().plan_qpos, [QPOS, QPOS[:3]], QPOS)
-    refuses("count is 0; it must be an integer", planner().IK, [0.5, 0, 0.4, *DOWN], QPOS, n_init_qpos=0)
-    refuses("resolution is -1.0; it must be a number", planner().update_point_cloud, [[1, 1, 1]], -1.0)
+    refuses("n_init_qpos: .*count is 0; it must be an integer", planner().IK, [0.5, 0, 0.4, *DOWN], QPOS, n_init_qpos=0)
+    refuses("radius is -1.0; it must be a number", planner().update_point_cloud, [[1, 1, 1]], -1.0)
     refuses(r"velocity limits are \[1.0\]; they must be 7 positive numbers", planner, joint_vel_limits=[1.0])
     refuses("acceleration limits are .*; they must be 7 positive", planner, joint_acc_limits=[-1.0] * 7)
     refuses("user_joint_names is 'panda_joint1'; it must be a list", planner, user_joint_names="panda_joint1")
-    refuses("urdf missing.urdf does not exist", Planner, "missing.urdf", HAND)
+    refuses("URDF missing.urdf does not exist", Planner, "missing.urdf", HAND)
     refuses("package_keyword_replacement is 'missing'; it must be a folder", Planner, __file__, HAND, "", "missing")
-    refuses("user_joint_names lacks panda_joint1", planner, user_joint_names=JOINTS[1:])
+    for names in (JOINTS[1:], JOINTS[::-1], (*JOINTS, JOINTS[0])):
+        refuses(f"user_joint_names is .*; it must name each joint that moves {HAND} once", planner, user_joint_names=names)
+    refuses("unknown joint in user_joint_names 'nose'", planner, user_joint_names=(*JOINTS, "nose"))
+    refuses("user_link_names is 'panda_hand'; it must be a list", planner, user_link_names=HAND)
     refuses("unknown link 'nose'", rd.Workspace, planner().robot, "nose")
 
 
@@ -165,6 +172,68 @@ def test_a_moved_base_keeps_obstacles_held_objects_and_allowed_contacts(made: Pl
     block = made.workspace.scene.shapes[0]
     assert isinstance(block, rd.Box) and np.allclose(block.center, [0.4, 0.0, -0.2])
     assert len(made.workspace.robot.attached) == 1
+
+
+def test_inverse_kinematics_take_poses_in_the_frame_of_the_base(made: Planner) -> None:
+    """Regression: in both versions of MPlib, IK takes poses in the base's frame although plans take them in the world's."""
+    made.set_base_pose(rd.pose([0.3, -0.2, 0.7], rpy=[0.0, 0.0, 1.0]))
+    _, found = made.IK(POSE, QPOS, [], 5, 1e-3)
+    assert isinstance(found, list) and len(found) > 1
+    assert np.allclose([made.robot.fk(q[:7], HAND) for q in found], matrix(POSE), atol=1e-3)
+
+
+def test_names_and_places_of_arguments_of_both_versions(made: Planner) -> None:
+    """Regression: MPlib 0.1's `pc`, `radius` and robot before `qpos`, and 0.2's `state` and `art_name` were TypeErrors."""
+    made.update_point_cloud(pc=[made.workspace.pose(QPOS[:7])[:3, 3]], radius=0.03)
+    assert isinstance(made.workspace.scene.shapes[0], rd.PointCloud) and made.workspace.scene.shapes[0].point_radius == 0.03
+    calls = [((QPOS,), {}), ((made.robot, QPOS, True), {}), ((), {"qpos": QPOS, "use_attach": True}), ((), {"state": QPOS})]
+    for arguments, named in calls:
+        assert made.check_for_env_collision(*arguments, **named) and not made.check_for_self_collision(*arguments, **named)
+    refuses(r"qpos is \(\); it must be 9 numbers", made.check_for_self_collision)
+
+
+def test_objects_are_held_by_the_link_that_is_named() -> None:
+    """Regression: `link_id` was ignored, so that a pose in another link's frame placed the object elsewhere."""
+    made = planner(user_link_names=["panda_link0", "panda_link7", HAND])
+    above = [0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0]
+    for arguments, named in (((1,), {}), ((None, 1), {}), ((), {"art_name": "panda", "link_id": 1}), ((np.int64(1),), {})):
+        made.update_attached_sphere(0.02, above, *arguments, **named)
+        assert made.workspace.robot.attached[0].link == "panda_link7"
+    made.update_attached_box([0.02] * 3, above)
+    assert made.workspace.robot.attached[0].link == HAND
+    refuses("unknown link_id 3; known: -1, 0, 1, 2", made.update_attached_box, [0.02] * 3, above, link_id=3)
+
+
+def test_a_mask_may_hold_joints_that_are_not_planned_only(made: Planner) -> None:
+    """Regression: a mask of planned joints was ignored, and they moved."""
+    assert made.IK(POSE, QPOS, mask=[False] * 7 + [True] * 2)[0] == "Success"
+    for call in (made.IK, made.plan_pose):
+        refuses("mask holds panda_joint2; planned joints cannot be held", call, POSE, QPOS, [0, 1, 0])
+
+
+@pytest.mark.parametrize("changed", ["arm.stl", "arm.srdf"])
+def test_a_robot_is_prepared_again_if_its_meshes_or_srdf_change(
+    changed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: only the URDF, the SRDF given and the move group were compared with those that had been prepared."""
+    monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
+    cube = trimesh.creation.box([0.1, 0.1, 0.2])
+    cube.export(tmp_path / "arm.stl")
+    link = "<collision><geometry><mesh filename='arm.stl'/></geometry></collision>"
+    limit = "<limit lower='-1' upper='1' velocity='1' effort='1'/>"
+    joint = f"<joint name='j' type='revolute'><parent link='base'/><child link='tool'/><axis xyz='0 1 0'/>{limit}</joint>"
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(f"<robot name='arm'><link name='base'/><link name='tool'>{link}</link>{joint}</robot>")
+    for _ in range(2):
+        assert len(Planner(urdf, "tool").joint_names) == 1
+    assert len([*(tmp_path / "robots").iterdir()]) == 1
+    cube.apply_scale(1.5).export(tmp_path / "arm.stl") if changed == "arm.stl" else (tmp_path / changed).write_text(
+        "<robot name='arm'/>"
+    )
+    made = Planner(urdf, "tool")
+    assert len([*(tmp_path / "robots").iterdir()]) == 2
+    height = np.ptp(made.robot.meshes["tool"][0].vertices[:, 2])
+    assert np.isclose(height, 0.3 if changed == "arm.stl" else 0.2, atol=5e-3)
 
 
 def test_where_no_motion_turns_evenly_one_that_turns_otherwise_has_a_note() -> None:

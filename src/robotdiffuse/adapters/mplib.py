@@ -23,12 +23,13 @@ from robotdiffuse.core.errors import (
     InputError,
     check_list,
     check_name,
+    located,
     numbers,
     positive,
     rigid_transform,
     shown,
 )
-from robotdiffuse.core.input_files import read_bytes
+from robotdiffuse.core.input_files import file_name, read_bytes
 from robotdiffuse.core.transforms import inverse, pose, transform
 from robotdiffuse.core.types import PlanResult
 from robotdiffuse.planning.workspace import Workspace
@@ -37,7 +38,8 @@ from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.bodies import RigidShape
 from robotdiffuse.robots.fitting.preparation import add_robot
-from robotdiffuse.robots.parsing.urdf import UrdfTree
+from robotdiffuse.robots.parsing.srdf import srdf_beside
+from robotdiffuse.robots.parsing.urdf import UrdfTree, with_limits
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import ROBOT_FILE, user_robots
 from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Sphere
@@ -85,8 +87,9 @@ class Planner:
         move_group: The link that goal poses refer to.
         srdf: SRDF with pairs of links that need no check; "" or none: these pairs are found by sampling.
         package_keyword_replacement: The folder that replaces `package://` in the URDF.
-        user_link_names: Ignored: links have the names of the URDF.
-        user_joint_names: Joints in the order of `qpos`; none: the planned joints.
+        user_link_names: Links that `link_id` counts from 0.
+        user_joint_names: Joints in the order of `qpos`, in which planned joints have the order of the chain;
+            none: the planned joints.
         joint_vel_limits: Velocity limits of the planned joints [rad/s]; none: 1, as in MPlib.
         joint_acc_limits: Acceleration limits of the planned joints [rad/s²]; none: those of the robot (MPlib:
             1).
@@ -96,8 +99,9 @@ class Planner:
         verbose: Ignored.
 
     Raises:
-        InputError: For files that cannot be read, unknown links, `user_joint_names` without a planned joint,
-            limits that are not a positive number for each planned joint, and `objects` that are not empty.
+        InputError: For files that cannot be read, unknown links and joints, `user_joint_names` that lacks a
+            planned joint, repeats or reorders them, limits that are not a positive number for each planned
+            joint, and `objects` that are not empty.
     """
 
     def __init__(
@@ -111,22 +115,34 @@ class Planner:
         joint_vel_limits: ArrayLike | None = None,
         joint_acc_limits: ArrayLike | None = None,
         new_package_keyword: str = "",
-        objects: Sequence = (),
+        objects: Sequence | None = (),
         use_convex: bool = False,
         verbose: bool = False,
     ) -> None:
-        if len(objects):
+        if objects is not None and len(objects):
             raise InputError("objects must be empty; add obstacles by `planner.workspace.add(rd.Box(...))`")
         check_list("user_joint_names", user_joint_names, str, "names of joints")
+        check_list("user_link_names", user_link_names, str, "names of links")
         robot = _robot(urdf, move_group, srdf, package_keyword_replacement or new_package_keyword)
         self.joint_names = tuple(user_joint_names) or robot.joint_names
-        missing = [name for name in robot.joint_names if name not in self.joint_names]
-        if missing:
-            raise InputError(f"user_joint_names lacks {', '.join(missing)}, which move {move_group}")
-        self._places = [self.joint_names.index(name) for name in robot.joint_names]
-        self.robot = _limited(robot, joint_vel_limits, joint_acc_limits)
-        self.workspace = Workspace(self.robot, move_group)
+        joints = [joint.name for joint in robot.joints]
+        for name in self.joint_names:
+            check_name("joint in user_joint_names", name, joints)
+        self._places = [i for i, name in enumerate(self.joint_names) if name in robot.joint_names]
+        if [self.joint_names[i] for i in self._places] != [*robot.joint_names]:
+            raise InputError(
+                f"user_joint_names is {shown(user_joint_names)}; it must name each joint that moves "
+                f"{move_group} once, in the order {', '.join(robot.joint_names)}"
+            )
+        self._links = {-1: move_group, **dict(enumerate(user_link_names))}
+        limited = _limited(robot, joint_vel_limits, joint_acc_limits)
+        self.workspace = Workspace(limited, move_group)
         """The robot and its obstacles. Add obstacles other than point clouds by `planner.workspace.add`."""
+
+    @property
+    def robot(self) -> Robot:
+        """The robot, with the object that it holds."""
+        return self.workspace.robot
 
     @property
     def joint_vel_limits(self) -> ndarray:
@@ -147,8 +163,7 @@ class Planner:
         self._limit(self.robot.velocity, values)
 
     def _limit(self, velocity: ArrayLike, acceleration: ArrayLike) -> None:
-        self.robot = _limited(self.robot, velocity, acceleration)
-        self.workspace.robot = _limited(self.workspace.robot, velocity, acceleration)
+        self.workspace.robot = _limited(self.robot, velocity, acceleration)
 
     def set_base_pose(self, pose: Any) -> None:
         """Place the base in the world. Obstacles stay where they are in the world.
@@ -160,16 +175,25 @@ class Planner:
         self.workspace = Workspace(before.robot, before.tip, matrix(pose))
         self.workspace.scene = before.scene.moved(inverse(self.workspace.T_world_base) @ before.T_world_base)
 
-    def update_point_cloud(self, points: ArrayLike, resolution: float = 1e-3, name: str = CLOUD) -> None:
+    def update_point_cloud(
+        self,
+        points: Any = None,
+        resolution: Any = 1e-3,
+        name: str = CLOUD,
+        pc: Any = None,
+        radius: Any = None,
+    ) -> None:
         """Replace the point cloud.
 
         Args:
             points: Points [n, 3] in the frame of the world [m].
             resolution: Radius of the sphere around each point [m]; at least 1 mm is used.
             name: Name of the cloud.
+            pc: MPlib 0.1's name of `points`.
+            radius: MPlib 0.1's name of `resolution`.
         """
-        radius = max(positive(CLOUD, "resolution", resolution), 1e-3)
-        self.workspace.add(PointCloud(points, radius, name=name))
+        least = positive(CLOUD, "radius", resolution if radius is None else radius)
+        self.workspace.add(PointCloud(points if pc is None else pc, max(least, 1e-3), name=name))
 
     def remove_point_cloud(self, name: str = CLOUD) -> bool:
         """Remove a point cloud; returns whether there was one."""
@@ -178,30 +202,32 @@ class Planner:
             self.workspace.remove(name)
         return present
 
-    def update_attached_box(self, size: ArrayLike, pose: Any, link_id: int = -1) -> None:
+    def update_attached_box(self, size: ArrayLike, pose: Any, *link: Any, **named: Any) -> None:
         """Hold a box instead of the object that was held before.
 
         Args:
             size: Edge lengths of the box [m].
-            pose: Pose of the box in the frame of the move group.
-            link_id: Ignored: the move group holds the box.
+            pose: Pose of the box in the frame of the link.
+            link: `link_id` (MPlib 0.1), or `art_name` and `link_id` (0.2): the place of the link in
+                `user_link_names`; -1 or none: the move group. `art_name` is ignored.
+            named: The same by name.
         """
-        self._hold(Box(np.zeros(3), size, name=HELD).moved(matrix(pose)))
+        self._hold(Box(np.zeros(3), size, name=HELD).moved(matrix(pose)), *link, **named)
 
-    def update_attached_sphere(self, radius: float, pose: Any, link_id: int = -1) -> None:
+    def update_attached_sphere(self, radius: float, pose: Any, *link: Any, **named: Any) -> None:
         """Hold a sphere; see `update_attached_box`."""
-        self._hold(Sphere(matrix(pose)[:3, 3], radius, name=HELD))
+        self._hold(Sphere(matrix(pose)[:3, 3], radius, name=HELD), *link, **named)
 
-    def update_attached_mesh(self, mesh_path: str | Path, pose: Any, link_id: int = -1) -> None:
+    def update_attached_mesh(self, mesh_path: str | Path, pose: Any, *link: Any, **named: Any) -> None:
         """Hold a mesh; see `update_attached_box`."""
-        self._hold(Mesh.from_file(mesh_path, name=HELD).moved(matrix(pose)))
+        self._hold(Mesh.from_file(mesh_path, name=HELD).moved(matrix(pose)), *link, **named)
 
     def detach_object(self, name: str = HELD, also_remove: bool = True) -> bool:
         """Release the held object, without adding it to the obstacles (`also_remove` is ignored). Returns
         whether an object was held."""
-        present = any(body.name == name for body in self.workspace.robot.attached)
+        present = any(body.name == name for body in self.robot.attached)
         if present:
-            self.workspace.robot = self.workspace.robot.detach(name)
+            self.workspace.robot = self.robot.detach(name)
         return present
 
     def IK(
@@ -210,16 +236,22 @@ class Planner:
         start_qpos: ArrayLike,
         mask: Any = None,
         n_init_qpos: int = 20,
+        threshold: float = 1e-3,
+        *,
         return_closest: bool = False,
-        **_: Any,
+        verbose: bool = False,
     ) -> tuple[str, list[ndarray] | ndarray | None]:
-        """Collision-free configurations that reach a pose, the nearest to the start first.
+        """Collision-free configurations that reach a pose in the frame of the base, the nearest to the start
+        first. `threshold` and `verbose` are ignored.
 
         Returns:
             "Success" and the configurations (with `return_closest`, the first one), or the reason and None.
         """
+        self._check_mask(mask)
         start = self._start(start_qpos)
-        solutions = self.workspace.ik(matrix(goal_pose), near=start, count=n_init_qpos)
+        T_world_tip = self.workspace.T_world_base @ matrix(goal_pose)
+        with located("n_init_qpos"):
+            solutions = self.workspace.ik(T_world_tip, near=start, count=n_init_qpos)
         states = [self.workspace.is_free(q) for q in solutions]
         free = [self._qpos(q, start_qpos) for q, state in zip(solutions, states, strict=True) if state]
         if free:
@@ -235,7 +267,7 @@ class Planner:
         Args:
             goal_pose: The pose, in the frame of the world, or of the base if `wrt_world` is False.
             current_qpos: The present joint values, in the order of `user_joint_names`.
-            mask: Ignored.
+            mask: True for joints that are held; these must not be planned joints.
             options: `time_step` [s] between rows (0.1), `planning_time` [s] (1), `wrt_world`; other options
                 of MPlib are ignored, and constraints are refused.
 
@@ -243,6 +275,7 @@ class Planner:
             A dictionary with `status`: "Success", or the reason for the failure. If the plan succeeded, also
             with `time`, `position`, `velocity`, `acceleration`, `duration` and `note`.
         """
+        self._check_mask(mask)
         goal = self._in_world(goal_pose, options)
         return self._planned("planning failed", partial(self.workspace.plan, goal), current_qpos, options)
 
@@ -297,15 +330,19 @@ class Planner:
     plan_qpos_to_pose = plan_pose
     plan_qpos_to_qpos = plan_qpos
 
-    def check_for_self_collision(self, qpos: ArrayLike) -> list[str]:
+    def check_for_self_collision(self, *state: Any, **options: Any) -> list[str]:
         """A list with the reason why a configuration is refused even if all obstacles are ignored; empty if
-        it is free."""
-        start = self._start(qpos)
-        return _reasons(Workspace(self.workspace.robot), start)
+        it is free. The configuration is the last argument (MPlib 0.1: after the robot), `qpos` or `state`."""
+        start = self._state(state[:2], options)
+        return _reasons(Workspace(self.robot), start)
 
-    def check_for_env_collision(self, qpos: ArrayLike, *_: Any, **_options: Any) -> list[str]:
-        """A list with the reason why a configuration is refused among the obstacles; empty if it is free."""
-        return _reasons(self.workspace, self._start(qpos))
+    def check_for_env_collision(self, *state: Any, **options: Any) -> list[str]:
+        """A list with the reason why a configuration is refused among the obstacles; empty if it is free. See
+        `check_for_self_collision`; MPlib 0.1's further arguments are ignored."""
+        return _reasons(self.workspace, self._state(state[:2], options))
+
+    def _state(self, arguments: Sequence[Any], options: dict[str, Any]) -> ndarray:
+        return self._start(options.get("qpos", options.get("state", [(), *arguments][-1])))
 
     def _planned(
         self, failed: str, plan: Callable[..., PlanResult], qpos: ArrayLike, options: dict[str, Any]
@@ -320,8 +357,9 @@ class Planner:
         step = options.get("time_step", 0.1)
         if positive("options", "time_step", step) < MIN_TIME_STEP:
             raise InputError(f"time_step is {step}; it must be at least {MIN_TIME_STEP} s")
+        time_limit = positive("options", "planning_time", options.get("planning_time", 1.0))
         try:
-            result = plan(start, time_limit=options.get("planning_time", 1.0))
+            result = plan(start, time_limit=time_limit)
         except InputError as error:
             return {"status": f"{failed}: {error}"}
         trajectory = result.trajectory
@@ -363,16 +401,16 @@ class Planner:
         """What joint values must be, for messages."""
         return f"{len(self.joint_names)} numbers, the values of {', '.join(self.joint_names)}"
 
-    def _start(self, qpos: ArrayLike) -> ndarray:
+    def _start(self, qpos: Any) -> ndarray:
         """The planned joints of `qpos`. Its other joints, such as fingers, are locked at their values in
         `qpos`, rounded to multiples of HELD_JOINT_STEP."""
         q = np.ravel(_array(qpos))
+        if len(q) not in (self.robot.dof, len(self.joint_names)) or not np.isfinite(q).all():
+            raise InputError(f"qpos is {shown(qpos)}; it must be {self._expected()}")
         if len(q) == self.robot.dof:
             return q
-        if len(q) != len(self.joint_names) or not np.isfinite(q).all():
-            raise InputError(f"qpos is {shown(qpos)}; it must be {self._expected()}")
         values = dict(zip(self.joint_names, q.tolist(), strict=True))
-        robot = self.workspace.robot
+        robot = self.robot
         locked = {
             joint.name: round(values[joint.name] / HELD_JOINT_STEP) * HELD_JOINT_STEP
             for joint in robot.joints
@@ -389,9 +427,18 @@ class Planner:
         qpos[self._places] = q
         return qpos
 
-    def _hold(self, shape: RigidShape) -> None:
+    def _check_mask(self, mask: Any) -> None:
+        flags = np.ravel(() if mask is None else mask)
+        held = [name for name, flag in zip(self.joint_names, flags, strict=False) if flag]
+        if not {*held}.isdisjoint(self.robot.joint_names):
+            raise InputError(f"mask holds {', '.join(held)}; planned joints cannot be held")
+
+    def _hold(self, shape: RigidShape, art_name: Any = None, link_id: Any = -1) -> None:
+        # the third argument of MPlib 0.1 is link_id
+        link = art_name if isinstance(art_name, int | np.integer) else link_id
+        check_name("link_id", link, self._links)
         self.detach_object()
-        self.workspace.robot = self.workspace.robot.attach(shape, self.workspace.tip)
+        self.workspace.robot = self.robot.attach(shape, self._links[int(link)])
 
 
 def _reasons(workspace: Workspace, q: ndarray) -> list[str]:
@@ -415,20 +462,23 @@ def matrix(value: Any) -> ndarray:
 
 
 def _robot(urdf: str | Path, tip: str, srdf: str | Path | None, package: str) -> Robot:
-    """The prepared robot. A URDF with new content is prepared first, and stored in the user's robots."""
+    """The prepared robot. A URDF with new content, or with new meshes, is prepared first, and stored in the
+    user's robots."""
     if str(urdf) in ROBOTS:
         return load_robot(str(urdf))
-    content = read_bytes(urdf, "urdf") + (read_bytes(srdf, "srdf") if srdf else b"") + tip.encode()
-    folder = user_robots() / f"{Path(urdf).stem}-{hashlib.sha256(content).hexdigest()[:8]}"
-    if (folder / ROBOT_FILE).is_file():
-        return load_robot(folder)
     packages: dict[str, str | Path] = {}
     if package:
         if not Path(package).is_dir():
             raise InputError(f"package_keyword_replacement is {shown(package)}; it must be a folder")
         packages = {entry.name: entry for entry in Path(package).iterdir() if entry.is_dir()}
-    UrdfTree(Path(urdf), packages)  # refuses xacro, which can run code
-    return add_robot(urdf, tip=tip, srdf=srdf or None, packages=packages, out=folder).robot
+    tree = UrdfTree(file_name(urdf, "urdf"), packages)  # refuses xacro, which can run code
+    semantics = srdf or srdf_beside(urdf, tree.name)
+    content = read_bytes(semantics, "srdf") if semantics else b""
+    content += f"{tree.digest} {tip} {bool(srdf)}".encode()
+    folder = user_robots() / f"{Path(urdf).stem}-{hashlib.sha256(content).hexdigest()[:8]}"
+    if not (folder / ROBOT_FILE).is_file():
+        add_robot(urdf, tip=tip, srdf=srdf or None, packages=packages, out=folder)
+    return load_robot(folder)
 
 
 def _limited(robot: Robot, velocity: ArrayLike | None, acceleration: ArrayLike | None) -> Robot:
@@ -450,8 +500,7 @@ def _limited(robot: Robot, velocity: ArrayLike | None, acceleration: ArrayLike |
         name: {"velocity": speed, "acceleration": most, "jerk": most / RAMP_TIME}
         for name, speed, most in zip(robot.joint_names, *rows, strict=True)
     }
-    joints = tuple(replace(joint, **limits.get(joint.name, {})) for joint in robot.joints)
-    return replace(robot, joints=joints)
+    return with_limits(robot, limits)
 
 
 def _array(value: object) -> ndarray:
