@@ -204,6 +204,15 @@ def test_objects_are_held_by_the_link_that_is_named() -> None:
     refuses("unknown link_id 3; known: -1, 0, 1, 2", made.update_attached_box, [0.02] * 3, above, link_id=3)
 
 
+def test_planners_with_equal_limits_share_a_robot() -> None:
+    """Regression: arrays for collision checks, most of the time of ManiSkill's plans, were computed anew in each episode."""
+    first, second = [planner(joint_vel_limits=np.full(7, 0.5)) for _ in range(2)]
+    for made in (first, second):
+        made.joint_vel_limits = 0.9 * made.joint_vel_limits
+        assert made.check_for_self_collision(QPOS) == []
+    assert first.robot is second.robot
+
+
 def test_a_mask_may_hold_joints_that_are_not_planned_only(made: Planner) -> None:
     """Regression: a mask of planned joints was ignored, and they moved."""
     assert made.IK(POSE, QPOS, mask=[False] * 7 + [True] * 2)[0] == "Success"

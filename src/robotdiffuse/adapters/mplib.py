@@ -8,7 +8,7 @@ matrix. If a plan fails, `status` contains the reason too.
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -495,10 +495,17 @@ def _limited(robot: Robot, velocity: ArrayLike | None, acceleration: ArrayLike |
                 f"{field} limits are {shown(given)}; they must be {robot.dof} positive numbers, one for each "
                 "planned joint"
             )
-        rows.append(values.tolist())
+        rows.append(tuple(values.tolist()))
+    return _with_limits(robot, *rows)
+
+
+@lru_cache(maxsize=64)
+def _with_limits(robot: Robot, velocity: tuple[float, ...], acceleration: tuple[float, ...]) -> Robot:
+    """The same object for equal limits, since arrays for collision checks are computed once for each robot:
+    ManiSkill makes a planner for each episode."""
     limits = {
         name: {"velocity": speed, "acceleration": most, "jerk": most / RAMP_TIME}
-        for name, speed, most in zip(robot.joint_names, *rows, strict=True)
+        for name, speed, most in zip(robot.joint_names, velocity, acceleration, strict=True)
     }
     return with_limits(robot, limits)
 
