@@ -53,7 +53,7 @@ def test_the_commands_of_pages_name_data_weights_and_family(tmp_path: Path) -> N
     settings = ablation.AblationSettings(data="rop", out="out", family="shelf", problems=1)
     half = ablation.Evaluation(*(np.full(1, 0.5) for _ in range(5)))
     page = ablation.table2(settings, [ablation.RowResult("Ours", half, half, (0.5,))])
-    assert "--problems 1 --family shelf --seeds 1\n" in page.markdown
+    assert "--problems 1 --family shelf --seeds 1 --rows 'Ours'\n" in page.markdown
 
 
 @pytest.mark.parametrize(

@@ -191,12 +191,15 @@ def run_ablation(
         _training(out / ENCODER / "encoder.json", "encoder_samples", settings.encoder_samples)
         digests = {}
         for _, training in pool.each(_train, [(settings, training) for training in trainings]):
-            file = out / training.folder / "model.json"
-            digests[training.folder] = _training(file, "samples", settings.samples)["data"]
+            digests[training.folder] = _training(
+                out / training.folder / "model.json", "samples", settings.samples
+            )["data"]
             report(f"trained {training.folder}")
         if len(set(digests.values())) > 1:
-            digests_text = ", ".join(f"{name} {digest}" for name, digest in digests.items())
-            raise InputError(f"{out} holds networks of different data: {digests_text}; use another folder")
+            raise InputError(
+                f"{out} holds networks of different data: {', '.join(map(' '.join, digests.items()))}; use "
+                "another folder"
+            )
         cases = hard_cases(settings.family, settings.problems, out / "problems", report)
         todo = [
             (settings, row_training, guided, cases)
@@ -206,7 +209,7 @@ def run_ablation(
         for number, evaluation in pool.each(_evaluate, todo):
             _, row_training, guided, _ = todo[number]
             evaluations[row_training, guided] = evaluation
-            name = row_training if isinstance(row_training, str) else row_training.folder
+            name = getattr(row_training, "folder", row_training)
             text = f"evaluated {name} {'with' if guided else 'without'} guidance"
             report(f"{text}: {100 * evaluation.single.mean():.1f} % of samples")
     results = []
@@ -252,7 +255,7 @@ def _train(settings: AblationSettings, training: Training) -> Training:
     if not (out / "model.json").exists():
         options = {"data": settings.data, "samples": settings.samples, "seed": training.seed}
         if "encoder" not in CONFIGS[training.config].changes:
-            options["encoder"] = str(FilePath(settings.out) / ENCODER)
+            options["encoder"] = f"{settings.out}/{ENCODER}"
         train_planner(planner_training(training.config, options), str(out))
     return training
 
@@ -318,6 +321,9 @@ def table2(settings: AblationSettings, results: list[RowResult]) -> Report:
         f"--encoder-samples {settings.encoder_samples} --problems {settings.problems} "
         f"--family {settings.family} --seeds {settings.seeds}"
     )
+    names = [result.name for result in results if result.name in ROWS]
+    if len(names) < len(ROWS):
+        command += f" --rows '{','.join(names)}'"
     report = paper_report("Table 2", command)
     report.table(table(settings, results), level=2)
     report.table(straight_line_table(settings.problems), level=2)
@@ -342,7 +348,6 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
         *(("each seed",) if several_seeds else ()),
         *("paper: suc", "col", "len", "s"),
     )
-    first = results[0].as_in_paper
     rows = []
     for result in results:
         evaluation = result.as_in_paper
@@ -355,7 +360,7 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
             float(evaluation.best.mean()),
             _share(evaluation.collided),
             Mean.of(evaluation.length).value,
-            Mean.of(evaluation.length / first.length).value,
+            Mean.of(evaluation.length / results[0].as_in_paper.length).value,
             float(np.median(evaluation.seconds)),
             _share(result.unguided.single),
             *((by_seed,) if several_seeds else ()),
