@@ -101,8 +101,12 @@ def test_problem_of_a_jsonl_file(tmp_path: Path, said: Said) -> None:
 
 
 def test_ctrl_c(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, said: Said) -> None:
-    monkeypatch.setattr("robotdiffuse.cli.plan.load_and_plan", Mock(side_effect=KeyboardInterrupt))
-    assert said(130, "plan", write_problem(tmp_path), "--planner", "rrt_connect") == "robotdiffuse: stopped\n"
+    """Regression: in compiled code that makes tuples, Ctrl-C is the cause of a SystemError, whose traceback was printed."""
+    from_compiled_code = SystemError("returned a result with an exception set")
+    from_compiled_code.__cause__ = KeyboardInterrupt()
+    for error in (KeyboardInterrupt, from_compiled_code):
+        monkeypatch.setattr("robotdiffuse.cli.plan.load_and_plan", Mock(side_effect=error))
+        assert said(130, "plan", write_problem(tmp_path), "--planner", "rrt_connect") == "robotdiffuse: stopped\n"
 
 
 def test_plan_takes_settings_of_the_planner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -74,7 +74,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refused(error, WRITE_FAILED if isinstance(error, OutputError) else BAD_INPUT)
     except MemoryError as error:
         return _refused(f"not enough memory; use smaller numbers. {error}")
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemError) as error:
+        cause: BaseException | None = error
+        while isinstance(cause, SystemError):  # as which Ctrl-C can leave compiled code
+            cause = cause.__cause__
+        if not isinstance(cause, KeyboardInterrupt):
+            raise
         print("robotdiffuse: stopped", file=sys.stderr)
         return STOPPED
     except BrokenPipeError:

@@ -247,8 +247,7 @@ class MotionModel(ABC):
 
     def normalize(self, q: Trajectories, reference: Reference) -> Trajectories:
         """Converts trajectories [rad] to x, with the ends of the reference."""
-        unit = self._unit(q)
-        return self.hold_ends((unit - reference.base) / self.statistics.residual_scale, reference)
+        return self.hold_ends((self._unit(q) - reference.base) / self.statistics.residual_scale, reference)
 
     def joints(self, x: Trajectories, reference: Reference) -> Trajectories:
         """Joint values of x [rad]."""
