@@ -137,7 +137,8 @@ def test_mimics_of_planned_joints_raise_unless_they_are_locked(tmp_path: Path) -
     held = read_urdf(written(tmp_path, ARM, bar), locked={"j2": 0.5})
     assert held.locked == {"rod": -0.5, "j2": 0.5} and held.dof == 5
     bare = bar.replace(link("bar"), link("bar", ""))
-    assert read_urdf(written(tmp_path, ARM, bare)).dof == 6
+    framed = read_urdf(written(tmp_path, ARM, bare))
+    assert framed.dof == 6 and "the pose of bar is wrong" in "".join(framed.notes)
     inside = link("end") + joint("last", "j6_link", "end", more='<mimic joint="j5"/>')
     refuses("last mimics j5", read_urdf, written(tmp_path, ARM, inside), tip="end")
 

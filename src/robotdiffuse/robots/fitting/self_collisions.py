@@ -251,15 +251,14 @@ def measure_false_collisions(
     """
     links = Links(robot)
     q = links.random(samples, rng)
-    for i, joint in enumerate(links.joints):
-        if joint.name in robot.locked:
-            q[:, i] = robot.locked[joint.name]
+    column = {joint.name: i for i, joint in enumerate(links.joints)}
+    for name in column.keys() & robot.locked:
+        q[:, column[name]] = robot.locked[name]
     poses = links.poses(q)
     trees = {
         link: tuple(coal_surface(part.vertices, part.faces) for part in parts)
         for link, parts in surfaces.items()
     }
-    column = {joint.name: i for i, joint in enumerate(links.joints)}
     collisions = []
     for a, b in robot.checked_pairs():
         first, second = (for_kernels(robot.spheres[link]) for link in (a, b))

@@ -323,22 +323,25 @@ def _ends(chosen: list[str], above: dict[str, Joint], written: list[str]) -> lis
     return list(last.values())
 
 
-def refuse_linkages(file: Path, robot: Robot) -> None:
-    """Raise InputError if a joint that mimics a planned joint moves geometry or a tip: planning would keep
-    the mimic joint still."""
+def linkage_notes(file: Path, robot: Robot) -> list[str]:
+    """Notes on joints that mimic planned joints, which planning keeps still. Raises InputError if such a
+    joint moves geometry or a tip."""
     by_name = {joint.name: joint for joint in robot.joints}
+    notes = []
     for joint in robot.joints:
         leader = joint
-        while leader.mimic is not None:
+        while leader.mimic:
             leader = by_name[leader.mimic.joint]
-        if joint.mimic is None or leader.name in robot.locked:
+        if leader is joint or leader.name in robot.locked:
             continue
+        what = f"joint {joint.name} mimics {leader.name}, which is planned; that is not supported: "
         if any(joint in robot.joints_above(link) for link in (*robot.meshes, *robot.tips)):
             raise InputError(
-                f"{file}: joint {joint.name} mimics {leader.name}, which is planned; that is not supported: "
-                f"hold {leader.name} with --lock {leader.name}=VALUE, end the arm above it with --tip, or "
-                f"remove {joint.name} and what it carries, which is then not checked"
+                f"{file}: {what}hold {leader.name} with --lock {leader.name}=VALUE, end the arm above it "
+                f"with --tip, or remove {joint.name} and what it carries, which is then not checked"
             )
+        notes.append(f"{what}it is held, so the pose of {joint.child} is wrong and must not be a goal")
+    return notes
 
 
 def _chosen_arms(file: Path, arms: list[Arm], group: str | None, groups: list[str]) -> list[Arm]:

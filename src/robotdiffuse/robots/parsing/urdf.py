@@ -42,7 +42,7 @@ from robotdiffuse.robots.fitting.convex_parts import MIN_THICKNESS, Surface, con
 from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT, MOVING_KINDS, Joint, Mimic, with_mimics
 from robotdiffuse.robots.parsing.mjcf import ConvertedModel, ellipsoid
 from robotdiffuse.robots.parsing.packages import Packages, compiled_xacro, is_xacro, with_prefixes
-from robotdiffuse.robots.parsing.srdf import Srdf, planned_joints, refuse_linkages
+from robotdiffuse.robots.parsing.srdf import Srdf, linkage_notes, planned_joints
 from robotdiffuse.robots.robot import Robot
 
 ROTATING_KINDS = ("revolute", "continuous")
@@ -258,8 +258,9 @@ class UrdfTree:
                     else "choose another --base or --tip"
                 )
             )
-        refuse_linkages(self.path, robot)
-        return replace(robot, notes=(*robot.notes, *self._size_notes(robot)))
+        return replace(
+            robot, notes=(*robot.notes, *linkage_notes(self.path, robot), *self._size_notes(robot))
+        )
 
     def _size_notes(self, robot: Robot) -> list[str]:
         """Notes on links above MAX_LINK_SIZE. Raises InputError if such a link moves and is larger than
