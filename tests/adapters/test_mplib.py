@@ -202,6 +202,8 @@ def test_objects_are_held_by_the_link_that_is_named() -> None:
     made.update_attached_box([0.02] * 3, above)
     assert made.workspace.robot.attached[0].link == HAND
     refuses("unknown link_id 3; known: -1, 0, 1, 2", made.update_attached_box, [0.02] * 3, above, link_id=3)
+    refuses("no planned joint moves 'panda_link0'", made.update_attached_box, [0.02] * 3, above, link_id=0)
+    assert [body.link for body in made.workspace.robot.attached] == [HAND]
 
 
 def test_planners_with_equal_limits_share_a_robot() -> None:

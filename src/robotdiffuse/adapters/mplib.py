@@ -437,8 +437,13 @@ class Planner:
         # the third argument of MPlib 0.1 is link_id
         link = art_name if isinstance(art_name, int | np.integer) else link_id
         check_name("link_id", link, self._links)
+        before = self.robot
         self.detach_object()
-        self.workspace.robot = self.robot.attach(shape, self._links[int(link)])
+        try:
+            self.workspace.robot = self.robot.attach(shape, self._links[int(link)])
+        except InputError:
+            self.workspace.robot = before
+            raise
 
 
 def _reasons(workspace: Workspace, q: ndarray) -> list[str]:
