@@ -2,7 +2,9 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
+import pytest
 import torch
 
 from helpers.refusals import refuses
@@ -41,6 +43,15 @@ def test_a_checkpoint_that_a_killed_run_left_half_written_is_removed(tmp_path: P
     (tmp_path / ".training.safetensors.0123456789abcdef.tmp").write_bytes(b"half")
     run_of(tmp_path, lambda call: 1.0).loop()
     assert not list(tmp_path.glob(".*"))
+
+
+def test_a_training_goes_on_without_plots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: TensorBoard's error on a full disk ended the training."""
+    pytest.importorskip("tensorboard")
+    monkeypatch.setattr("torch.utils.tensorboard.SummaryWriter", Mock(side_effect=OSError))
+    run = run_of(tmp_path, lambda call: 1.0)
+    run.loop()
+    assert run.at.samples == 40
 
 
 def test_a_short_training_that_diverged_writes_no_weights(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path as FilePath
@@ -277,8 +277,12 @@ class TrainingRun:
                     last = now
                     if self.at.step % LOG_EVERY == 0:
                         self._log(None)
-                        text = f"{self.rows[-1]['loss']:.4f}"
-                        progress.update(bar, completed=self.fraction, rate=f"{rate:,.0f}/s", loss=text)
+                        progress.update(
+                            bar,
+                            completed=self.fraction,
+                            rate=f"{rate:,.0f}/s",
+                            loss=f"{self.rows[-1]['loss']:.4f}",
+                        )
                     if due:
                         self._checkpoint(progress.console)
                         saved = time.monotonic()
@@ -429,7 +433,8 @@ class TrainingRun:
         shutil.rmtree(
             folder, ignore_errors=True
         )  # written anew, so that a resumed run leaves no second curve
-        with SummaryWriter(str(folder)) as writer:
+        # without plots, as on a full disk, the training is not lost
+        with suppress(OSError), SummaryWriter(str(folder)) as writer:
             for row in self.rows:
                 for name in ("learning_rate", "loss", "validation", "success"):
                     if row[name] != "":
