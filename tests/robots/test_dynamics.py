@@ -14,6 +14,7 @@ from helpers.refusals import refuses
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
 from robotdiffuse.robots.dynamics import GRAVITY, Dynamics
+from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
@@ -117,6 +118,17 @@ def test_wrong_payloads_and_robots_without_inertias_are_one_line() -> None:
     middle = (arm.lower + arm.upper) / 2
     told = "iiwa14 has no inertia of what moves with joint joint_a1"
     refuses(told, rd.Problem, arm, rd.Scene(), middle, middle, payload=rd.Payload(1.0))
+
+
+def test_frames_of_a_mobile_base_need_no_inertia() -> None:
+    """The joints of a base with wheels are a chain of links without geometry; a link with geometry needs an inertia."""
+    arm = pendulum()
+    slide = Joint("x", "prismatic", "map", "base", np.eye(4), np.array([1.0, 0, 0]), -1.0, 1.0, 1.0, 4.0, 40.0, effort=99.0)
+    cart = replace(arm, base="map", joints=(slide, *arm.joints))
+    load, q = rd.Payload(1.5, [0.0, 0.0, -1.0]), np.array([[0.3, 0.7]])
+    torques = Dynamics(cart, load).holding_torques(q)
+    np.testing.assert_allclose(torques, [[0, Dynamics(arm, load).holding_torques(q[:, 1:])[0, 0]]], atol=1e-9)
+    refuses("no inertia of what moves with joint x", Dynamics, replace(cart, meshes={"base": PANDA.meshes["panda_hand"]}), load)
 
 
 def test_files_keep_payloads(tmp_path: Path) -> None:

@@ -88,7 +88,6 @@ class Dynamics:
             import pinocchio as installed
         pinocchio: Any = installed  # compiled, without types
         check_dynamics(robot)
-        link = payload.link or robot.tip
         self.robot = robot
         self.limits = robot.effort
         self._rnea, model = pinocchio.rnea, pinocchio.Model()
@@ -96,14 +95,14 @@ class Dynamics:
             kind = pinocchio.JointModelPZ() if robot.prismatic[j] else pinocchio.JointModelRZ()
             parent = int(robot.parents[j])
             model.addJoint(parent, kind, pinocchio.SE3(T[:3, :3], T[:3, 3]), robot.joint_names[j])
-        moments = np.diag(payload.moments)
-        carried = [(link, Inertia(payload.mass, payload.com, moments))] if payload.mass > MIN_MASS else []
+        load = Inertia(payload.mass, payload.com, np.diag(payload.moments))
+        carried = [(payload.link or robot.tip, load)] if payload.mass > MIN_MASS else []
         for name, inertia in (*robot.inertias.items(), *carried):
             T = robot.T_frame_link(name)
             frame = robot.link_frame(name)
             body = pinocchio.Inertia(inertia.mass, inertia.com, inertia.moments)
             model.appendBodyToJoint(frame, body, pinocchio.SE3(T[:3, :3], T[:3, 3]))
-        up = np.array([0.0, 0.0, 1.0]) if T_world_base is None else T_world_base[2, :3]
+        up = np.eye(3)[2] if T_world_base is None else T_world_base[2, :3]
         model.gravity.linear = -GRAVITY * up
         self._model, self._data = model, model.createData()
         self._bodies = [
@@ -187,8 +186,7 @@ class Dynamics:
 
     def holding_torques(self, q: Configurations) -> Configurations:
         """Torques at rest [N m] or [N]."""
-        still = np.zeros_like(q)
-        return self.torques(q, still, still)
+        return self.torques(q, 0 * q, 0 * q)
 
     def overload_message(self, q: Configuration) -> str | None:
         """A message about the joint with the largest torque at rest relative to its limit; None if all
@@ -205,12 +203,13 @@ class Dynamics:
 
 
 def check_dynamics(robot: Robot) -> None:
-    """Raise InputError if a planned joint of the robot has no effort limit or moves no link with an
-    inertia."""
-    frames_with_mass = {robot.link_frame(link) for link in robot.inertias}
+    """Raise InputError if a planned joint of the robot has no effort limit, or if links with geometry move
+    with it but none with an inertia. Frames without geometry, as in a mobile base, need no inertia."""
+    solid, heavy = ({robot.link_frame(link) for link in links} for links in (robot.meshes, robot.inertias))
     for j, name in enumerate(robot.joint_names):
-        missing = "inertia of what moves with" if j + 1 not in frames_with_mass else "effort limit of"
-        if not robot.effort[j] > 0 or j + 1 not in frames_with_mass:
+        weightless = j + 1 in solid - heavy
+        missing = "inertia of what moves with" if weightless else "effort limit of"
+        if weightless or not robot.effort[j] > 0:
             raise InputError(
                 f"payload: {robot.name} has no {missing} joint {name}; its URDF must give inertias and "
                 f"effort limits; then create the robot again with: robotdiffuse robot add"
