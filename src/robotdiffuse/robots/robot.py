@@ -279,7 +279,8 @@ class Robot(KinematicTree):
         """Lock joints at values. Joints that mimic them follow.
 
         Values may exceed the URDF's limits by up to the joint's range, since some published problems open
-        grippers that far. Calls with equal values return the same object.
+        grippers that far; pairs of links that never collide within the limits stay unchecked there. Calls
+        with equal values return the same object.
 
         Args:
             locked: Values [rad] or [m] by joint name. Planned joints may be locked as well.
