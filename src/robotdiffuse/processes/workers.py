@@ -482,8 +482,7 @@ def _main(connection: Connection) -> None:
     threading.Thread(target=_this.receive, daemon=True).start()
     try:
         _this.send(0.0)  # the message for which `Worker._start` waits
-        _, message = _this.calls.get()
-        entries, prepare, arguments = pickle.loads(message)
+        entries, prepare, arguments = pickle.loads(_this.calls.get()[1])
         adopt_entries(entries)
         _this.send(pickle.dumps((prepare(*arguments), None)))
     except BrokenPipeError:  # the parent has died
@@ -508,9 +507,9 @@ def _exit_by_signal_with_parent() -> None:
 
     `_Process.receive` alone is not enough: it waits while compiled code or imports hold the interpreter.
     """
-    parent = multiprocessing.parent_process()
+    parent: Any = multiprocessing.parent_process()
     with suppress(OSError, AttributeError):  # other systems have only the thread
-        pipe = parent.sentinel if parent is not None else -1
+        pipe = parent.sentinel
         fcntl.fcntl(pipe, fcntl.F_SETOWN, os.getpid())
         fcntl.fcntl(pipe, fcntl.F_SETFL, fcntl.fcntl(pipe, fcntl.F_GETFL) | os.O_ASYNC)
 
