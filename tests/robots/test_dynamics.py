@@ -111,6 +111,7 @@ def test_wrong_payloads_and_robots_without_inertias_are_one_line() -> None:
         ({"mass": -1}, "payload.mass is -1; it must be a number of kg from 0 to 10000"),
         ({"com": [0, 0, 0]}, "missing field of payload: mass|payload.*mass"),
         ({"mass": 1, "link": "hand"}, "unknown link in payload.link: 'hand'"),
+        ({"mass": 1, "moments": [0.1, 0.1, 0.3]}, "payload.moments is .*; none may be larger than the other two together"),
         ({"mass": 1, "weight": 2}, "unknown field of payload: 'weight'"),
     ):
         refuses(message, problem_from_record, GOOD | {"payload": data})

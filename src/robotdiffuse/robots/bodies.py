@@ -124,7 +124,7 @@ class Payload(Value):
     """A mass that a link carries; joint torques must support it in addition to the arm.
 
     Raises InputError for numbers that are not finite or too large, for negative mass or moments of inertia,
-    and for a link that is not a name.
+    for moments that no body has, and for a link that is not a name.
     """
 
     mass: float
@@ -152,6 +152,10 @@ class Payload(Value):
                     f"{MAX_COORDINATE:g}"
                 )
             object.__setattr__(self, name, value if shape else float(value))
+        if 2 * max(self.moments) > sum(self.moments) * (1 + 1e-9):
+            raise InputError(
+                f"payload.moments is {shown(self.moments)}; none may be larger than the other two together"
+            )
         if self.link is not None and not isinstance(self.link, str):
             raise InputError(f"payload.link is {shown(self.link)}; it must be the name of a link")
         super().__post_init__()
