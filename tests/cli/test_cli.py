@@ -22,6 +22,7 @@ from robotdiffuse.core.loading import compiled
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.problems.fields import problem_schema
 from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.files import SHAPES
 
 TRAIN = ["train", "planner", "--data", "d", "--encoder", "dgcnn", "--out", "o"]
 BAD_CALL = {
@@ -145,19 +146,36 @@ def test_planners_are_listed_without_loading_them_and_so_are_their_settings(said
     assert said(2, "planner", "info", "aorrt").endswith("did you mean aorrtc?\n")
 
 
-def test_a_module_of_the_current_folder_adds_planners(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Said) -> None:
+def test_a_module_of_the_current_folder_adds_planners_and_shapes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Said
+) -> None:
+    """Regression: results with an added shape could be planned, but not verified, drawn or exported."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setattr(registry, "imported", [])
-    (tmp_path / "added_planners.py").write_text(
+    (tmp_path / "added.py").write_text(
         "from dataclasses import replace\nfrom robotdiffuse.planning import PLANNERS\n"
         "PLANNERS['mine'] = replace(PLANNERS['aorrtc'], description='my own')\n"
+        "from robotdiffuse.scenes.files import SHAPES\nfrom robotdiffuse.scenes.shapes import Sphere\n"
+        "class Ball(Sphere):\n    kind = 'ball'\nSHAPES['ball'] = Ball\n"
     )
+    problem = write_problem(tmp_path, scene=[{"ball": {"center": [0.5, 0.0, 1.5], "radius": 0.1}}])
     try:
-        assert "my own" in said(0, "planner", "list", "--import", "added_planners")
-        assert run("plan", write_problem(tmp_path), "--planner", "mine", "--import", "added_planners") == 0
+        assert "my own" in said(0, "planner", "list", "--import", "added")
+        assert run("plan", problem, "--planner", "mine", "--import", "added", "--out", "result.json") == 0
+        SHAPES.pop("ball")
+        assert "ball" in said(2, "verify", "result.json")
+        monkeypatch.setattr(registry, "imported", [])
+        monkeypatch.delitem(sys.modules, "added")
+        for command in (
+            ("verify", "result.json"),
+            ("export", "result.json", "--out", "a.csv"),
+            ("verify", "a.csv", "--problem", problem),
+        ):
+            assert run(*command, "--import", "added") == 0
     finally:
         PLANNERS.pop("mine", None)
+        SHAPES.pop("ball", None)
     error = said(2, "planner", "list", "--import", "no_such_module")
     assert "module 'no_such_module' cannot be imported: ModuleNotFoundError" in error
 

@@ -163,6 +163,7 @@ PLANNING = (
                     *ADDRESS,
                 ),
             ),
+            IMPORT,
         ),
     ),
     Command(
@@ -178,6 +179,7 @@ PLANNING = (
             ("--planner NAME", "planner; see `robotdiffuse planner list` (default: robotdiffuse)"),
             ("--time-limit S", "time limit of each plan (default: 1 s)", positive),
             *ADDRESS,
+            IMPORT,
         ),
     ),
     Command(
@@ -207,6 +209,7 @@ PLANNING = (
                 "memory of a worker, at least 512; requests that need more are refused (default: 2048 MB)",
                 megabytes,
             ),
+            IMPORT,
         ),
     ),
 )
@@ -240,6 +243,7 @@ CHECKS = (
                 "--certificate FILE.json",
                 "write a proof that the motion is valid, for `robotdiffuse certificate check`",
             ),
+            IMPORT,
         ),
     ),
     Command(
@@ -259,6 +263,7 @@ CHECKS = (
                         "--problem FILE",
                         "problem file to check it for (default: the problem in the certificate)",
                     ),
+                    IMPORT,
                 ),
             ),
         ),
@@ -288,6 +293,7 @@ CHECKS = (
                 not_negative,
                 0.0,
             ),
+            IMPORT,
         ),
     ),
     Command(
@@ -299,6 +305,7 @@ CHECKS = (
         (
             RESULT,
             ("--out FILE *", "replay (.html) or picture (.png) of the simulated motion; repeatable"),
+            IMPORT,
         ),
     ),
     Command(
@@ -316,6 +323,7 @@ CHECKS = (
                 "resample the motion at this rate for a controller, and validate the resampled motion",
                 float,
             ),
+            IMPORT,
         ),
     ),
     Command(
@@ -328,6 +336,7 @@ CHECKS = (
             ("--to HOST[:PORT] !", "rosbridge server (port: 9090)", address),
             ("--topic NAME", "topic to publish on (default: /joint_trajectory)", None, "/joint_trajectory"),
             ("--timeout S", "timeout of the connection (default: 5 s)", positive, 5.0),
+            IMPORT,
         ),
     ),
 )
