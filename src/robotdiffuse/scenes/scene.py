@@ -260,18 +260,18 @@ def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
         placed.mocap_pos[:] = data.mocap_pos
         placed.mocap_quat[:] = data.mocap_quat
     mujoco.mj_kinematics(model, placed)
-    base_body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, base)
-    if base_body < 0:
-        raise unknown_name("body", base, [model.body(k).name for k in range(model.nbody)])
+    bodies = [model.body(k).name for k in range(model.nbody)]
+    check_name("body", base, bodies)
+    base_body = bodies.index(base)
     T_base_world = inverse(transform(placed.xpos[base_body], placed.xmat[base_body].reshape(3, 3)))
     robot_bodies = set(mjcf.robot_bodies(model))
-    colliding = model.geom_contype | model.geom_conaffinity
+    colliding = mjcf.colliding_geoms(model)
     shapes: list[Shape] = []
     for geom in range(model.ngeom):
         body = int(model.geom_bodyid[geom])
         if body in robot_bodies or not colliding[geom]:
             continue
-        name = model.geom(geom).name or model.body(body).name or f"geom{geom}"
+        name = model.geom(geom).name or bodies[body] or f"geom{geom}"
         T = T_base_world @ transform(placed.geom_xpos[geom], placed.geom_xmat[geom].reshape(3, 3))
         center = T[:3, 3]
         wxyz = quaternion_from_rotation(T[:3, :3])

@@ -141,14 +141,17 @@ def test_a_scene_is_all_that_is_not_the_robot(file: Path) -> None:
 
 
 FIELD = '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>'
-CLOTH = '<flexcomp name="cloth" type="grid" count="3 3 1" spacing="1 1 1" radius="0.1" dim="2"/>'
+CLOTH = """<flexcomp name="cloth" type="grid" count="3 3 1" spacing="1 1 1" radius="0.1" dim="2">
+  {}</flexcomp>"""
+TIED_CLOTH = CLOTH.format('<edge equality="true"/>')
+"""Without constraints, MuJoCo warns."""
 
 
 def test_obstacles_that_are_no_solids_are_refused() -> None:
     """Regression: soft bodies were left out without a note."""
     for assets, world, message in (
         (FIELD, '<geom name="hill" type="hfield" hfield="h"/>', "geom hill is of type hfield; obstacles may"),
-        ("", CLOTH, "flex cloth is soft; obstacles must be rigid"),
+        ("", TIED_CLOTH, "flex cloth is soft; obstacles must be rigid"),
     ):
         model = mujoco.MjModel.from_xml_string(f"<mujoco>{assets}<worldbody>{world}</worldbody></mujoco>")
         refuses(message, rd.Scene.from_mujoco, model)
@@ -183,12 +186,71 @@ BODY = "<mujoco><worldbody><body>{}<geom size='1'/></body></worldbody></mujoco>"
         (BODY.format("<joint/><geom type='sdf' mesh='m'/>"), "is no valid MuJoCo model"),
         ("<mujoco><worldbody><body><joint", "is not well-formed XML"),
         ("<mujoco><worldbody><box/></worldbody></mujoco>", "no valid MuJoCo model: .*Element .box., line 1$"),
-        ("<mujoco><asset><mesh name='m' file='none.stl'/></asset></mujoco>", "none.stl.*; meshes are STL"),
+        ("<mujoco><asset><mesh name='m' file='none.stl'/></asset></mujoco>", "none.stl.*; meshes .STL, OBJ"),
     ],
 )
 def test_bad_models_are_one_line(text: str, wanted: str, tmp_path: Path) -> None:
     (tmp_path / "m.xml").write_text(text)
     refuses(wanted, lambda: UrdfTree(tmp_path / "m.xml", {}).robot())
+
+
+NAMED = """
+<mujoco>
+  <worldbody>
+    <body name="base">
+      <geom name="foot" size="0.1"/><geom name="wall" size="0.1" pos="5 0 0" contype="0" conaffinity="0"/>
+      <body name="arm" pos="0 0 0.3">
+        <joint name="a" axis="0 1 0" range="-90 90"/><geom size="0.04" pos="0 0 0.1"/>
+        <body name="hand" pos="0 0 0.3">
+          <joint name="b" axis="0 1 0" range="-150 150"/>
+          <geom name="palm" size="0.04" contype="0" conaffinity="0"/><geom size="0.01" contype="0" conaffinity="0"/>
+        </body>
+      </body>
+    </body>
+    <geom name="post" size="0.1" pos="9 0 0" contype="0" conaffinity="0"/>
+  </worldbody>
+  <contact>{}</contact>
+</mujoco>
+"""
+PAIRS = '<pair geom1="foot" geom2="palm"/><pair geom1="post" geom2="palm"/>'
+
+
+def test_geoms_of_named_pairs_collide(tmp_path: Path) -> None:
+    """Regression: geoms that collide only in pairs that the model names were left out, so MuJoCo saw contacts where the arm
+    counted as free; and a named pair counted as excluded, if masks or an exclusion excluded its bodies."""
+    file = tmp_path / "m.xml"
+    file.write_text(NAMED.format(f'<exclude body1="base" body2="hand"/>{PAIRS}'))
+    tree = UrdfTree(file, {})
+    assert [len(tree.surfaces(link)) for link in ("base", "arm", "hand")] == [1, 1, 1]
+    assert tree.semantics is not None
+    assert set(tree.semantics.allowed) == {frozenset(("arm", "hand"))}
+    [post] = rd.Scene.from_mujoco(mujoco.MjModel.from_xml_path(str(file))).shapes
+    assert post.name == "post"
+
+
+def test_a_model_with_other_exclusions_or_keyframes_is_another_robot(tmp_path: Path) -> None:
+    """Regression: `load_robot` took the robot that had been prepared before a pair of links was checked again, so this pair
+    stayed unchecked; named poses stayed old, too."""
+    digests = []
+    for old, new in (("", ""), ("", ""), ('body2="elbow"', 'body2="wrist"'), ("0.5 0.1 0.4", "0.5 0.1 0.5")):
+        (tmp_path / "m.xml").write_text(ARM.replace(old, new))
+        digests.append(UrdfTree(tmp_path / "m.xml", {}).digest)
+    assert digests[0] == digests[1]
+    assert len(set(digests)) == 3
+
+
+def test_reading_a_model_neither_warns_nor_writes_a_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
+) -> None:
+    """Regression: MuJoCo's warnings were shown as Python's, or written to MUJOCO_LOG.TXT in the user's folder."""
+    monkeypatch.chdir(tmp_path)
+    Path("cloth.xml").write_text(NAMED.format("").replace("<worldbody>", "<worldbody>" + CLOTH.format("")))
+    Path("nan.xml").write_text(NAMED.format("").replace("</mujoco>", '<keyframe><key qpos="nan 0"/></keyframe></mujoco>'))
+    UrdfTree(Path("cloth.xml"), {})
+    refuses("nan.xml: a value in qpos of a keyframe is no finite number", UrdfTree, Path("nan.xml"), {})
+    assert not [warning for warning in recwarn if warning.category is not ResourceWarning]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["cloth.xml", "nan.xml"]
+    assert mujoco.get_mju_user_warning() is None
 
 
 TIED = """
@@ -200,9 +262,11 @@ TIED = """
 
 
 def test_constraints_that_are_not_followed_are_noted(tmp_path: Path) -> None:
-    """Regression: only polynomials of joints were noted."""
-    (tmp_path / "m.xml").write_text(TIED)
-    notes = [note for note in UrdfTree(tmp_path / "m.xml", {}).robot().notes if "equality" in note]
+    """Regression: only polynomials of joints were noted; then, all but limits of tendons."""
+    (tmp_path / "m.xml").write_text(TIED.replace('name="t"', 'name="t" range="0 1"'))
+    tree = UrdfTree(tmp_path / "m.xml", {})
+    assert "the limits of tendon t are ignored" in tree.notes
+    notes = [note for note in tree.robot().notes if "equality" in note]
     for note, kind in zip(notes, ("joint", "connect", "tendon"), strict=True):
         assert f"({kind}) is ignored; hold what it ties" in note
 

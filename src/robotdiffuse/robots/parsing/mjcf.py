@@ -5,6 +5,7 @@ Each body and each site of the model becomes a link with the body's or site's fr
 `qpos`.
 """
 
+import warnings
 import xml.etree.ElementTree as ET
 from itertools import combinations
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import MAX_WORD, InputError, needs, shortened
@@ -53,42 +54,43 @@ def compiled_model(path: Path) -> Any:
     """
     with needs("mujoco (to read MuJoCo models)", "mujoco"):
         mujoco = imported_mujoco()
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(str)  # without a handler, MuJoCo writes MUJOCO_LOG.TXT in the working folder
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        spec.compiler.fusestatic = False  # bodies without joints are links, too
-        return spec.compile()
+        with warnings.catch_warnings(action="ignore"):
+            spec = mujoco.MjSpec.from_file(str(path))
+            spec.compiler.fusestatic = False  # bodies without joints are links, too
+            return spec.compile()
     except Exception as error:  # MuJoCo raises several kinds of errors for a damaged model
         text = shortened(error, MAX_WORD)
         unopened = text.startswith("Error: Error opening")
-        remedy = "; meshes are STL, OBJ or MSH files in its meshdir" if unopened else ""
+        remedy = "; meshes (STL, OBJ or MSH) are in its meshdir, textures in texturedir" if unopened else ""
         raise InputError(f"{path} is no valid MuJoCo model: {text}{remedy}") from None
+    finally:
+        mujoco.set_mju_user_warning(handler)
+
+
+def colliding_geoms(model: Any) -> Bool[ndarray, "_"]:
+    """Whether each geom collides with anything: by its masks, or in a pair that the model names."""
+    colliding = (model.geom_contype | model.geom_conaffinity) > 0
+    colliding[[*model.pair_geom1, *model.pair_geom2]] = True
+    return colliding
 
 
 def robot_bodies(model: Any) -> list[int]:
     """The bodies of the robot, parents before children: the bodies of all kinematic trees that actuators of
     joints move. If there is no such tree, the robot is all trees with hinges or slides and without a free
     joint."""
-    trees: dict[int, list[int]] = {}
-    for body in range(1, model.nbody):
-        trees.setdefault(int(model.body_rootid[body]), []).append(body)
-    joints = {root: _joints_of(model, bodies) for root, bodies in trees.items()}
-    kinds = {
-        root: {kind_of("Joint", model.jnt_type[joint]) for joint in tree_joints}
-        for root, tree_joints in joints.items()
-    }
-    driven = {
-        int(model.actuator_trnid[k, 0])
+    roots = model.body_rootid[model.jnt_bodyid]
+    kinds = [kind_of("Joint", kind) for kind in model.jnt_type]
+    chosen = {
+        roots[model.actuator_trnid[k, 0]]
         for k in range(model.nu)
         if kind_of("Trn", model.actuator_trntype[k]) in ("joint", "jointinparent")
     }
-    chosen = [root for root, tree_joints in joints.items() if driven & set(tree_joints)]
     if not chosen:
-        chosen = [
-            root
-            for root, tree_kinds in kinds.items()
-            if tree_kinds.intersection(MOVABLE) and "free" not in tree_kinds
-        ]
-    return [body for root in chosen for body in trees[root]]
+        chosen = {*roots[np.isin(kinds, MOVABLE)]} - {*roots[np.isin(kinds, "free")]}
+    return np.flatnonzero(np.isin(model.body_rootid, [*chosen])).tolist()
 
 
 def placing_joints(model: Any, bodies: list[int]) -> set[int]:
@@ -109,11 +111,7 @@ def kind_of(enumeration: str, value: Any) -> str:
 
 
 def _joints_of(model: Any, bodies: list[int]) -> list[int]:
-    return [
-        joint
-        for body in bodies
-        for joint in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
-    ]
+    return np.flatnonzero(np.isin(model.jnt_bodyid, bodies)).tolist()
 
 
 class ConvertedModel:
@@ -129,8 +127,7 @@ class ConvertedModel:
         self.root = ET.Element("robot", name=bytes(model.names).partition(b"\0")[0].decode() or path.stem)
         self.bodies = robot_bodies(model)
         self.held = placing_joints(model, self.bodies)
-        self.masks = model.geom_contype | model.geom_conaffinity
-        """Collision masks of the geoms: 0 for geoms that collide with nothing."""
+        self.colliding = colliding_geoms(model)
         self.notes: list[str] = []
         self.links: set[str] = set()
         self.meshes: dict[str, str] = {}
@@ -187,9 +184,12 @@ class ConvertedModel:
             label = self.joint_name(joint)
             kind = self.joint_kind(joint)
             if kind == "free" or joint in self.held:
-                slide = f"slide joint {label}, which has no range,"
-                joint_text = slide if kind == "slide" else f"the free joint of {name}"
-                self.notes.append(f"{joint_text} is held where the model places it")
+                held = (
+                    f"slide joint {label}, which has no range,"
+                    if kind == "slide"
+                    else f"the free joint of {name}"
+                )
+                self.notes.append(f"{held} is held where the model places it")
                 continue
             if kind == "ball":
                 raise InputError(f"{self.path}: joint {label} is a ball joint; use three hinges in its place")
@@ -217,7 +217,7 @@ class ConvertedModel:
         model = self.model
         label = self.joint_name(joint)
         slides = self.joint_kind(joint) == "slide"
-        limited = bool(model.jnt_limited[joint])
+        limited = model.jnt_limited[joint]
         if slides and not limited:
             raise InputError(f"{self.path}: slide joint {label} has no range; give it one")
         kind = "prismatic" if slides else "revolute" if limited else "continuous"
@@ -249,6 +249,11 @@ class ConvertedModel:
 
     def _mimics(self) -> dict[int, dict[str, str]]:
         model = self.model
+        self.notes += [
+            f"the limits of tendon {self.name('tendon', k)} are ignored"
+            for k in range(model.ntendon)
+            if model.tendon_limited[k]
+        ]
         mimics: dict[int, dict[str, str]] = {}
         for k in range(model.neq):
             if not model.eq_active0[k]:
@@ -284,9 +289,9 @@ class ConvertedModel:
             xx, yy, zz = map(repr, model.body_inertia[body].tolist())
             ET.SubElement(inertial, "inertia", ixx=xx, iyy=yy, izz=zz, ixy="0", ixz="0", iyz="0")
         for geom in _geoms_of(model, body):
-            if not self.masks[geom] and kind_of("Geom", model.geom_type[geom]) not in GEOMS:
+            if not self.colliding[geom] and kind_of("Geom", model.geom_type[geom]) not in GEOMS:
                 continue
-            element = ET.SubElement(link, "collision" if self.masks[geom] else "visual")
+            element = ET.SubElement(link, "collision" if self.colliding[geom] else "visual")
             T = _pose(model.geom_pos[geom], model.geom_quat[geom])
             _origin(element, T)
             self._shape(ET.SubElement(element, "geometry"), geom)
@@ -305,7 +310,7 @@ class ConvertedModel:
             ET.SubElement(parent, "mesh", filename=self._written(ellipsoid(size), f"geom{geom}"))
         elif kind == "mesh":
             index = int(self.model.geom_dataid[geom])
-            solid = bool(self.masks[geom])
+            solid = self.colliding[geom]
             name = f"{'hull' if solid else 'mesh'}{index}"
             if name not in self.meshes:
                 mesh = mesh_of(self.model, index)
@@ -327,11 +332,10 @@ class ConvertedModel:
         return f"{name}.stl"
 
     def _sites(self) -> None:
-        bodies = set(self.bodies)
         for site in range(self.model.nsite):
             body = int(self.model.site_bodyid[site])
             name = self.name("site", site)
-            if body not in bodies:
+            if body not in self.bodies:
                 continue
             link = name if name not in self.links else f"{name}_site"
             T = _pose(self.model.site_pos[site], self.model.site_quat[site])
@@ -341,12 +345,16 @@ class ConvertedModel:
     def _excluded(self) -> dict[frozenset[str], str]:
         """Pairs of links that MuJoCo does not check for collision: excluded pairs, rigidly connected links, a
         link and the link that carries it, and links between which the masks of all geoms exclude
-        collision."""
+        collision; but not links with geoms that the model names as a pair."""
         model = self.model
-        excluded = {frozenset(divmod(int(signature), 2**16)) for signature in model.exclude_signature}
-        no_filter = imported_mujoco().mjtDisableBit.mjDSBL_FILTERPARENT
-        unfiltered = bool(model.opt.disableflags & int(no_filter))
-        geoms = {body: [geom for geom in _geoms_of(model, body) if self.masks[geom]] for body in self.bodies}
+        excluded, named = (
+            {frozenset(divmod(int(signature), 2**16)) for signature in signatures}
+            for signatures in (model.exclude_signature, model.pair_signature)
+        )
+        unfiltered = bool(model.opt.disableflags & imported_mujoco().mjtDisableBit.mjDSBL_FILTERPARENT)
+        geoms = {
+            body: [geom for geom in _geoms_of(model, body) if self.colliding[geom]] for body in self.bodies
+        }
         solid = [body for body in self.bodies if geoms[body]]
 
         def meet(first: int, second: int) -> bool:
@@ -358,7 +366,8 @@ class ConvertedModel:
         pairs = [
             pair
             for pair in combinations(solid, 2)
-            if frozenset(pair) in excluded or _related(model, *pair, unfiltered) or not meet(*pair)
+            if frozenset(pair) not in named
+            and (frozenset(pair) in excluded or _related(model, *pair, unfiltered) or not meet(*pair))
         ]
         if len(solid) > 1 and len(pairs) == len(solid) * (len(solid) - 1) // 2:
             self.notes.append("by the masks and exclusions of the model, no two of its links may collide")
@@ -366,6 +375,8 @@ class ConvertedModel:
 
     def _poses(self) -> dict[str, dict[str, float]]:
         model = self.model
+        if not np.isfinite(model.key_qpos).all():
+            raise InputError(f"{self.path}: a value in qpos of a keyframe is no finite number")
         places = {
             self.joint_name(joint): model.jnt_qposadr[joint]
             for joint in _joints_of(model, self.bodies)
@@ -379,9 +390,9 @@ class ConvertedModel:
 
 def mesh_of(model: Any, mesh: int) -> trimesh.Trimesh:
     """A mesh of a model in the frame of its geoms [m]."""
-    vertices = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
-    faces = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
-    return trimesh.Trimesh(model.mesh_vert[vertices], model.mesh_face[faces], process=False)
+    vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
+    faces = model.mesh_face[model.mesh_faceadr[mesh] :][: model.mesh_facenum[mesh]]
+    return trimesh.Trimesh(vertices, faces, process=False)
 
 
 def ellipsoid(radii: Vector) -> trimesh.Trimesh:
@@ -392,18 +403,18 @@ def ellipsoid(radii: Vector) -> trimesh.Trimesh:
     return ball
 
 
-def _geoms_of(model: Any, body: int) -> range:
-    return range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
+def _geoms_of(model: Any, body: int) -> list[int]:
+    return np.flatnonzero(model.geom_bodyid == body).tolist()
 
 
 def _related(model: Any, first: int, second: int, unfiltered: bool) -> bool:
     """Whether two bodies are rigidly connected, or one is the parent of the other. Rigidly connected bodies
     count as one body, and bodies fixed to the world are no parents. `unfiltered`: whether the model lets a
     body collide with its parent."""
-    welded = [int(model.body_weldid[body]) for body in (first, second)]
-    above = [int(model.body_weldid[model.body_parentid[body]]) for body in welded]
+    welded = model.body_weldid[[first, second]]
+    above = model.body_weldid[model.body_parentid[welded]]
     carried = welded[0] == above[1] or welded[1] == above[0]
-    return welded[0] == welded[1] or (carried and WORLD not in welded and not unfiltered)
+    return bool(welded[0] == welded[1] or (carried and WORLD not in welded and not unfiltered))
 
 
 def _pose(xyz: Vector, wxyz: Float[ndarray, "4"]) -> Pose:

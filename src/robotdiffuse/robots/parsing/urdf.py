@@ -282,8 +282,11 @@ class UrdfTree:
     @property
     def digest(self) -> str:
         """SHA-256 of the URDF and of the mesh files of its collision geometry. For a xacro file or a MuJoCo
-        model, the URDF that was made from it is hashed."""
+        model, the URDF that was made from it is hashed, with excluded pairs and poses."""
         digest = hashlib.sha256(self.text)
+        if self.semantics:
+            allowed = sorted(map(sorted, self.semantics.allowed))
+            digest.update(repr((allowed, self.semantics.poses)).encode())
         for element in self.links.values():
             for mesh in element.findall(f"{self.kind}/geometry/mesh"):
                 digest.update(read_bytes(self.packages.file(mesh.get("filename", "")), "mesh file"))
