@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from helpers.refusals import refuses
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.robots.fitting import preparation
 from robotdiffuse.robots.fitting.preparation import LARGE_REACH, PreparationSettings, add_robot
+from robotdiffuse.robots.fitting.self_collisions import FalseCollisions
 from robotdiffuse.robots.parsing.urdf import UrdfTree
 
 PREPARED = {"a gantry", "names with slashes and spaces", "tiny links", "links without geometry", "xacro"}
@@ -76,12 +78,22 @@ def test_an_arm_that_is_never_free_is_refused_with_the_pair_to_allow(tmp_path: P
     pair = ("column", "bellows2_link")
     how = {"base": "base", "tip": "j3_link", "out": tmp_path / "robot", "settings": QUICK}
     with coarse_grids():
-        text = refuses("the arm collides with itself in every configuration", add_robot, on_a_lift(tmp_path), **how)
+        text = refuses("collides with itself in every configuration", add_robot, on_a_lift(tmp_path), **how)
     assert f"{pair[0]} and {pair[1]} collide in 100.0%" in text and "--srdf FILE" in text
     assert f"--allow {pair[0]} {pair[1]}" in text and text.count("--allow") == 1
     assert not (tmp_path / "robot").exists()
     with coarse_grids():
         assert add_robot(on_a_lift(tmp_path), allow=[pair], **how).false_collisions.free > 0.2
+
+
+def test_an_arm_whose_spheres_always_collide_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: a PR2, with which nothing could be planned, was written with the exit status 0."""
+    pair = Mock(links=("a", "b"), colliding=0.0, by_spheres=1.0)
+    prepared = Mock(false_collisions=FalseCollisions(0.7, 0.0, 1.0, (pair,)))
+    monkeypatch.setattr(preparation, "prepare", lambda *_: prepared)
+    message = "a and b collide in 100.0%; .*--allow a b,"
+    refuses(message, add_robot, on_a_lift(tmp_path), base="base", tip="j3_link", out=tmp_path / "robot")
+    assert not (tmp_path / "robot").exists()
 
 
 def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:

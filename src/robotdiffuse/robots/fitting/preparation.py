@@ -337,7 +337,7 @@ def _refined(
     """The robot with finer parts and spheres, or with tables, for pairs of links with many false collisions;
     `k` is the number of refinements before."""
     worst_pairs = _worst(false_collisions, settings.max_false_collisions)
-    table_pairs = {pair.links for pair in worst_pairs if _beyond_spheres(robot, pair, settings)}
+    table_pairs = {pair.links for pair in worst_pairs if _beyond_spheres(robot, pair, settings, k)}
     coarse_links = {
         name
         for pair in worst_pairs
@@ -411,10 +411,11 @@ def _with_tables(
     return replace(robot, tables=tuple(tables.values()))
 
 
-def _beyond_spheres(robot: Robot, pair: PairFalseCollisions, settings: PreparationSettings) -> bool:
-    """Whether even the finest spheres of a pair would collide falsely too often, and one or two joints are
-    between the links, so that a table can be used instead."""
-    narrow_fraction = (pair.gaps < 2 * settings.finest).mean() if len(pair.gaps) else 0.0
+def _beyond_spheres(robot: Robot, pair: PairFalseCollisions, settings: PreparationSettings, k: int) -> bool:
+    """Whether even the finest spheres of a pair would collide falsely too often, or those of an earlier
+    refinement (`k` > 0) do, and one or two joints are between the links, so that a table can be used
+    instead."""
+    narrow_fraction = 1.0 if k else (pair.gaps < 2 * settings.finest).mean() if len(pair.gaps) else 0.0
     hopeless = narrow_fraction * (pair.by_spheres - pair.by_parts) > settings.max_false_collisions / 3
     return bool(hopeless) and len(robot.joints_between(*pair.links)) in (1, 2)
 
@@ -620,16 +621,15 @@ def add_robot(
         settings = replace(settings, sampling=replace(settings.sampling, assumptions=False))
     prepared = prepare(robot, surfaces, settings, seed, progress, allowed)
     measured = prepared.false_collisions
-    if measured.free == 0 or measured.by_parts == 1:  # nothing can be planned
-        shares = {pair.links: max(pair.colliding, pair.by_parts) for pair in measured.pairs}
+    if measured.free == 0 or measured.by_spheres == 1:  # nothing can be planned
+        shares = {pair.links: max(pair.colliding, pair.by_spheres) for pair in measured.pairs}
         often = sorted(shares, key=lambda pair: -shares[pair])
         colliding_pairs = [pair for pair in often if shares[pair] == 1] or often[:MAX_PROPOSED]
         options = " ".join(f"--allow {' '.join(pair)}" for pair in colliding_pairs)
         names = "; ".join(f"{' and '.join(pair)} collide in {shares[pair]:.1%}" for pair in colliding_pairs)
         raise InputError(
-            f"{urdf}: the arm collides with itself in every configuration: {names}; if these links may "
-            f"touch, add {options}, or give an SRDF that allows such "
-            f"pairs with --srdf FILE"
+            f"{urdf}: the arm, enclosed by spheres, collides with itself in every configuration: {names}; if "
+            f"these links may touch, add {options}, or give an SRDF that allows such pairs with --srdf FILE"
         )
     differences = tuple(
         PairDifference(
