@@ -14,7 +14,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import jaxtyping
 import pytest
 from hypothesis import settings
-from jaxtyping import install_import_hook
 
 SOURCE = Path(__file__).parents[1] / "src" / "robotdiffuse"
 _KERNELS = r"robotdiffuse\.(collision\.kernels\.random|core\.kernels)"
@@ -61,7 +60,7 @@ def keep_dimensions_of_shapes_alone() -> None:
 
 parse_in_one_thread_at_a_time()
 keep_dimensions_of_shapes_alone()
-install_import_hook(checked_modules(), "beartype.beartype")
+jaxtyping.install_import_hook(checked_modules(), "beartype.beartype")
 
 # the same examples at every run: a suite that fails by chance guards nothing
 settings.register_profile("suite", deadline=None, max_examples=40, derandomize=True)

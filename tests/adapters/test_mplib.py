@@ -82,8 +82,7 @@ def test_arguments_of_both_versions(made: Planner) -> None:
     assert made.plan_screw(goal_pose=POSE, current_qpos=QPOS, wrt_world=True, verbose=False)["status"] == "Success"
     _, closest = made.IK(POSE, QPOS, return_closest=True)
     assert isinstance(closest, np.ndarray) and closest.shape == (9,)
-    unlimited = planner(joint_vel_limits=None, joint_acc_limits=None, srdf=None)
-    assert np.array_equal(unlimited.joint_vel_limits, np.ones(7))
+    assert np.array_equal(planner(joint_vel_limits=None, joint_acc_limits=None, srdf=None).joint_vel_limits, np.ones(7))
     with pytest.raises(TypeError, match="joint_vel_limit'"):
         planner(joint_vel_limit=np.full(7, 0.2))
 

@@ -8,7 +8,6 @@ from helpers.example_robots import planar_arm
 from helpers.panda import LEFT, PANDA, RIGHT
 from helpers.refusals import refuses
 from robotdiffuse.baselines import controls, straight_line
-from robotdiffuse.baselines.straight_line import StraightLine, StraightLineSettings
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.exported_model import exported_model
 
@@ -63,8 +62,7 @@ def test_smooth_noise_has_the_covariance_of_the_pandas_weights_and_keeps_ends_an
     half = np.minimum(0.5 * (PANDA.upper - PANDA.lower), controls.MAX_HALF_RANGE)
     rows = np.moveaxis(q / half, 1, 2).reshape(-1, 48)
     assert abs(rows.std() - controls.SPREAD) < 0.005
-    model = exported_model("model", None, PANDA)
-    factor = model.statistics.noise_factor.astype(np.float64)
+    factor = exported_model("model", None, PANDA).statistics.noise_factor.astype(np.float64)
     shares = [np.linalg.eigvalsh(c)[::-1] / np.trace(c) for c in (rows.T @ rows, factor @ factor.T)]
     assert np.abs(shares[0] - shares[1]).max() < 0.012
     goals = np.stack([MIDDLE, MIDDLE + 0.1]).astype(np.float32)
@@ -77,9 +75,9 @@ def test_smooth_noise_has_the_covariance_of_the_pandas_weights_and_keeps_ends_an
 def test_any_goal_is_tried_where_the_nearest_is_blocked() -> None:
     free = np.append(2.8, RIGHT[1:])
     problem = rd.Problem(PANDA, WALL, LEFT, rd.JointGoal([RIGHT, free]))
-    found = StraightLine().plan(problem, 5.0)
+    found = straight_line.StraightLine().plan(problem, 5.0)
     assert found.solved
     np.testing.assert_array_equal(found.path.positions, [LEFT, free])
-    alone = StraightLine(StraightLineSettings(goals=straight_line.NEAREST)).plan(problem, 5.0)
+    alone = straight_line.StraightLine(straight_line.StraightLineSettings(goals=straight_line.NEAREST)).plan(problem, 5.0)
     assert not alone.solved and alone.refused == "scene_collision"
     assert "the straight line is refused" in alone.reason

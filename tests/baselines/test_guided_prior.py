@@ -8,7 +8,6 @@ import pytest
 import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray
-from torch import Tensor
 
 from helpers.panda import LEFT, PANDA, RIGHT
 from helpers.refusals import refuses
@@ -47,20 +46,19 @@ class Gaussian(MotionNetwork):
 
     def denoise(
         self,
-        features: Float[Tensor, "batch rows features"],
-        level: Float[Tensor, "batch"],
-        condition: Float[Tensor, "batch condition"],
-        dropped: Bool[Tensor, "batch"] | None = None,
-    ) -> Float[Tensor, "batch rows dof"]:
+        features: Float[torch.Tensor, "batch rows features"],
+        level: Float[torch.Tensor, "batch"],
+        condition: Float[torch.Tensor, "batch condition"],
+        dropped: Bool[torch.Tensor, "batch"] | None = None,
+    ) -> Float[torch.Tensor, "batch rows dof"]:
         at = round(float(level[0]) * self.schedule.steps)
         x = features.numpy()
         signal = float(self.schedule.signal[at])
         noise = float(self.schedule.noise[at])
-        inner = x[:, 1:-1].astype(np.float64)
         t = np.linspace(0, 1, x.shape[1])[1:-1, None]
         line = (1 - t) * x[:, :1] + t * x[:, -1:]
         total = signal**2 * bumps(x.shape[1]) + noise**2 * np.eye(x.shape[1] - 2)
-        seen = noise * np.linalg.solve(total, inner - signal * line)
+        seen = noise * np.linalg.solve(total, x[:, 1:-1].astype(np.float64) - signal * line)
         return torch.nn.functional.pad(torch.from_numpy(seen.astype(np.float32)), (0, 0, 1, 1))
 
 
@@ -82,9 +80,8 @@ def data_of(count: int, waypoints: int = WAYPOINTS) -> TrajectoryData:
 def test_the_loss_falls() -> None:
     torch.manual_seed(0)
     network = MotionNetwork(RANGES, SMALL)
-    data = data_of(32)
     rng = np.random.default_rng(0)
-    batches = Batches(data, network, lambda _scenes, _q: np.zeros(0), 0.1, None)
+    batches = Batches(data_of(32), network, lambda _scenes, _q: np.zeros(0), 0.1, None)
     loss_of = PlannerLoss(network, PANDA, TRAINING, Processes("cpu"))
     losses = trained(network, lambda _: loss_of(batches.draw(16, rng), 0.0, rng), 40, 4e-3)
     # an untrained network predicts no noise, whose variance is 1
@@ -153,19 +150,17 @@ def test_spaced_levels(spaced, steps: int) -> None:
 def test_the_precision_is_that_of_the_process() -> None:
     """Compares with the covariance of the process, propagated from a first state with a large variance."""
     waypoints = 8
-    vague = 1e3 * np.eye(2)
     transition = np.array([[1.0, 1.0], [0.0, 1.0]])
     noise = np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])
     covariance = np.zeros((2 * waypoints, 2 * waypoints))
-    covariance[:2, :2] = vague
+    covariance[:2, :2] = 1e3 * np.eye(2)
     for i in range(1, waypoints):
         here = slice(2 * i, 2 * i + 2)
         before = slice(2 * i - 2, 2 * i)
         covariance[here, : 2 * i] = transition @ covariance[before, : 2 * i]
         covariance[: 2 * i, here] = covariance[here, : 2 * i].T
         covariance[here, here] = transition @ covariance[before, before] @ transition.T + noise
-    positions = np.linalg.inv(covariance[::2, ::2])
-    assert guided_prior.position_precision(waypoints) == pytest.approx(positions, abs=0.01)
+    assert guided_prior.position_precision(waypoints) == pytest.approx(np.linalg.inv(covariance[::2, ::2]), abs=0.01)
 
 
 def test_implicit_step_of_the_process() -> None:
@@ -210,8 +205,7 @@ def test_guidance_lowers_the_collision_cost() -> None:
     before = collision_costs(q, (0.0, 0.0))
     for planner in (guided_prior.MPD(), guided_prior.EDMP(guided_prior.EDMPSettings(samples=12))):
         moved = planner.guided(CHECKER, q, 0)
-        after = collision_costs(moved, (0.0, 0.0))
-        assert np.all(after < before) and np.array_equal(moved[:, [0, -1]], q[:, [0, -1]])
+        assert np.all(collision_costs(moved, (0.0, 0.0)) < before) and np.array_equal(moved[:, [0, -1]], q[:, [0, -1]])
 
 
 def test_each_guide_moves_only_its_rows() -> None:

@@ -78,11 +78,9 @@ def cost_of(search: LatticeSearch, checker: CollisionChecker) -> float:
     assert (path is None) == (outcome is Outcome.EXHAUSTED)
     if path is None:
         return np.inf
-    length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
-    assert length == pytest.approx(search.cost, rel=1e-5, abs=1e-5)
+    assert np.linalg.norm(np.diff(path, axis=0), axis=1).sum() == pytest.approx(search.cost, rel=1e-5, abs=1e-5)
     assert np.abs(search.goals - path[-1]).max(axis=1).min() < 1e-6
-    space = search_space(checker, 0.01)
-    assert motions_free(space, path.astype(np.float32)).all()
+    assert motions_free(search_space(checker, 0.01), path.astype(np.float32)).all()
     return search.cost
 
 
@@ -91,10 +89,9 @@ def cost_of(search: LatticeSearch, checker: CollisionChecker) -> float:
 def test_both_find_the_least_cost_and_inflation_bounds_it(seed, joints):
     checker, start, goals, _ = arm_problem(seed)
     settings = {"spacing": SPACING, "joints_per_move": joints, "resolution": 0.01, "clearance": 0.0}
-    expected = least_cost(checker, start, goals, joints)
     a_star = LatticeSearch(checker, start, goals, AStarSettings(inflation=1.0, **settings))
     d_star = LatticeSearch(checker, start, goals, DStarLiteSettings(**settings))
-    assert cost_of(a_star, checker) == pytest.approx(expected, rel=1e-5)
+    assert cost_of(a_star, checker) == pytest.approx(least_cost(checker, start, goals, joints), rel=1e-5)
     assert cost_of(d_star, checker) == a_star.cost
     fast = LatticeSearch(checker, start, goals, AStarSettings(inflation=2.0, **settings))
     assert a_star.cost - 1e-6 <= cost_of(fast, checker) <= 2 * a_star.cost + 1e-6
@@ -158,8 +155,7 @@ def test_start_buried_and_freed_again():
     search = LatticeSearch(checker, start, goals, DStarLiteSettings(spacing=0.3, clearance=0.0))
     cost = cost_of(search, checker)
     assert cost < np.inf
-    around = Box([0.0, 0.0, 0.0], [4.0, 4.0, 1.0])
-    search.update(CollisionChecker(ARM, Scene([*checker.scene.shapes, around])), start)
+    search.update(CollisionChecker(ARM, Scene([*checker.scene.shapes, Box([0.0, 0.0, 0.0], [4.0, 4.0, 1.0])])), start)
     assert search.run() is Outcome.EXHAUSTED and search.path() is None
     search.update(checker, start)
     assert cost_of(search, checker) == cost

@@ -46,8 +46,7 @@ def line_data(walls: bool) -> TrajectoryData:
 
 
 def clouds_of(network: mpinets.MPiNetsNetwork, count: int, seed: int = 0) -> torch.Tensor:
-    data = line_data(True)
-    return network.clouds(data.scenes[:count], np.random.default_rng(seed))
+    return network.clouds(line_data(True).scenes[:count], np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("points", [20, 300])

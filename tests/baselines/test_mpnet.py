@@ -42,8 +42,7 @@ def motions(waypoints: int = 48) -> TrajectoryData:
         q.append((way if i % 2 else way[::-1]).astype(np.float32))
         scenes.append(Scene([Box([0.5, 0.0, height / 2], [0.3, 0.05, height])]))
     trivial = np.array([False, False, False, True])
-    even = resample(np.stack(q), waypoints)
-    return TrajectoryData(even, PackedScenes.pack(scenes, 2), trivial, None, "made", 0)
+    return TrajectoryData(resample(np.stack(q), waypoints), PackedScenes.pack(scenes, 2), trivial, None, "made", 0)
 
 
 @pytest.fixture(scope="module")
@@ -99,9 +98,8 @@ def test_the_contractive_penalty_is_the_jacobian_squared(code: int, draws: int, 
 
 
 def test_waypoints_are_a_step_apart_or_the_goal() -> None:
-    net = network(replace(SMALL, step=0.5))
     data = motions()
-    here, following, goal = net.training_samples(data.q, np.random.default_rng(0))
+    here, following, goal = network(replace(SMALL, step=0.5)).training_samples(data.q, np.random.default_rng(0))
     moved = np.linalg.norm(following - here, axis=1)
     at_goal = (following == goal).all(1)
     assert len(here) == len(data) * SMALL.waypoints and 0 < at_goal.mean() < 0.7
@@ -115,8 +113,7 @@ def test_the_order_of_the_points_does_not_matter_and_no_points_are_zeros() -> No
     net = network()
     rng = np.random.default_rng(0)
     cloud = torch.from_numpy(rng.uniform([-0.5, -0.5, 0.1], [0.5, 0.5, 0.9], (2, 40, 3)).astype(np.float32))
-    shuffled = cloud[:, torch.from_numpy(rng.permutation(40))]
-    torch.testing.assert_close(net.encode(cloud), net.encode(shuffled))
+    torch.testing.assert_close(net.encode(cloud), net.encode(cloud[:, torch.from_numpy(rng.permutation(40))]))
     near = sorted_along_curve(cloud, net.region)
     steps = (near[:, 1:] - near[:, :-1]).norm(dim=-1).mean()
     assert steps < 0.7 * (cloud[:, 1:] - cloud[:, :-1]).norm(dim=-1).mean(), "neighbors are near each other"

@@ -79,11 +79,9 @@ def test_same_seed_same_path(planner):
 
 
 def test_range_bounds_the_extensions_which_simplifying_shortens():
-    settings = ompl.OmplSettings(range=0.3, simplify=False)
-    result = ompl.OmplRRT(settings).plan(problem(RIGHT), 120.0, seed=1)
+    result = ompl.OmplRRT(ompl.OmplSettings(range=0.3, simplify=False)).plan(problem(RIGHT), 120.0, seed=1)
     assert np.linalg.norm(np.diff(result.path.positions, axis=0), axis=1).max() < 0.3 + 1e-6
-    simplified = ompl.OmplRRT(ompl.OmplSettings(range=0.3)).plan(problem(RIGHT), 120.0, seed=1)
-    assert simplified.path.length < result.path.length
+    assert ompl.OmplRRT(ompl.OmplSettings(range=0.3)).plan(problem(RIGHT), 120.0, seed=1).path.length < result.path.length
     for planner in (ompl.OmplPRM, ompl.OmplBITStar):
         refuses(f"{planner.name} has no range", planner, ompl.OmplSettings(range=1.0))
 

@@ -7,8 +7,7 @@ import coal
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
@@ -84,9 +83,8 @@ def test_distances_are_those_of_coal() -> None:
         for point, distance in zip(points, found[:, k], strict=True):
             ball = coal.Sphere(1e-9)
             place = coal.Transform3s(np.eye(3), point)
-            request = coal.DistanceRequest()
             right = min(
-                coal.distance(ball, place, piece, coal.Transform3s(R, t), request, coal.DistanceResult())
+                coal.distance(ball, place, piece, coal.Transform3s(R, t), coal.DistanceRequest(), coal.DistanceResult())
                 for piece, t in zip(pieces, at, strict=True)
             )
             if isinstance(body, proofs.Surface) and count == 3 and right > 0.1:  # of triangles far away, their balls
@@ -117,9 +115,8 @@ def test_nothing_moves_further_than_its_displacement(seed: int) -> None:
     ends = rng.uniform(PANDA.lower, PANDA.upper, (2, PANDA.dof))
     ends[1] = ends[0] + (ends[1] - ends[0]) * rng.uniform(0, 0.5)
     prover = proofs.Prover(PANDA, rd.Scene(), ends, np.zeros_like(ends[1:]))
-    claims = np.arange(len(prover.claims))
     ones = np.ones(len(prover.claims))
-    bounds = prover.bounds(proofs.Stretches(claims, 0 * ones, ones), ones < 0, [])
+    bounds = prover.bounds(proofs.Stretches(np.arange(len(prover.claims)), 0 * ones, ones), ones < 0, [])
     middle = prover.at(np.array([0.5]))
     linkage = prover.linkage
     places = linkage.place(np.concatenate([middle, prover.at(rng.uniform(0, 1, 8))])).T

@@ -49,8 +49,7 @@ def test_what_is_valid_can_be_certified_and_what_is_certified_is_free(name: str)
     certificate = rd.certify(problem, path)
     assert certificate.check(problem).differences == ()
     exact = ExactCollision(problem.robot, problem.scene)
-    at = np.linspace(0, 2, 60)
-    q = np.stack([np.interp(at, np.arange(3), column) for column in SWING.T], axis=1)
+    q = np.stack([np.interp(np.linspace(0, 2, 60), np.arange(3), column) for column in SWING.T], axis=1)
     least = min(d.distance for row in q for d in exact.link_distances(row))
     assert report.scene_clearance is not None
     assert 0.5 * report.scene_clearance - 1e-4 <= certificate.scene_clearance <= min(least, 1.0)
@@ -99,8 +98,7 @@ def test_short_steps_hide_no_rate_from_the_checker(name: str, monkeypatch: pytes
     problem, path = problem_of(np.outer(place, [1, 0, 0]))
     still = np.zeros_like(path.positions)
     motion = rd.Trajectory(path.joint_names, times, path.positions, still, still)
-    report = Report(True, None, 1.0, 0.2)
-    monkeypatch.setattr("robotdiffuse.certificates.search.verify", lambda *_: report)
+    monkeypatch.setattr("robotdiffuse.certificates.search.verify", lambda *_: Report(True, None, 1.0, 0.2))
     found = rd.certify(problem, motion).check(problem).differences
     assert any(wanted in line for line in found), found
     assert all(line.startswith("motion: ") and "j0" in line for line in found), found
@@ -126,9 +124,8 @@ def test_an_empty_proof_of_one_row_is_none(with_times: bool) -> None:
 
 def test_tolerances_are_those_of_the_validator() -> None:
     """The checker has its own copy of the tolerances, since it does not import the validator."""
-    settings = VerifySettings()
     for name, value in asdict(Tolerances()).items():
-        assert getattr(settings, name) == value
+        assert getattr(VerifySettings(), name) == value
 
 
 @pytest.mark.parametrize(

@@ -283,9 +283,8 @@ def test_robot_add_with_srdf_and_robot_list(
     allowed = load_robot("made").allowed_collisions
     assert frozenset(("j1_link", "j4_link")) in allowed
     assert frozenset(("base", "j4_link")) not in allowed  # found beside: compared, not taken
-    given = ("--srdf", str(tmp_path / "made.srdf"), "--name", "by_srdf")
     with coarse_grids():
-        assert run("robot", "add", str(file), *given) == 0
+        assert run("robot", "add", file, "--srdf", tmp_path / "made.srdf", "--name", "by_srdf") == 0
     assert frozenset(("base", "j4_link")) in load_robot("by_srdf").allowed_collisions
     assert "unknown link in allow 'moon'" in said(2, "robot", "add", str(file), "--allow", "base", "moon")
     refused = said(2, "robot", "add", str(file), "--out", "made.srdf")

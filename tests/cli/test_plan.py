@@ -15,7 +15,6 @@ from helpers.commands import GOAL, PROBLEM, START, Said, run, write_problem
 from robotdiffuse.cli.demo import shelf_problem
 from robotdiffuse.planning import load_planner, planner_settings
 from robotdiffuse.problems.files import load_problem, problem_record
-from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.visualization.picture import PictureSettings
 
 ROOT = Path(__file__).parents[2]
@@ -88,8 +87,7 @@ def test_a_result_saved_from_python_holds_its_problem(tmp_path: Path, said: Said
     result.save("r.json")
     assert rd.load_result("r.json").problem == problem_record(problem)
     assert run("verify", "r.json") == run("export", "r.json", "--out", "r.csv") == 0
-    unnamed = replace(problem, robot=replace(problem.robot, name="mine", source=None))
-    replace(result, problem=unnamed).save("unnamed.json")
+    replace(result, problem=replace(problem, robot=replace(problem.robot, name="mine", source=None))).save("unnamed.json")
     assert "holds no problem (without its problem: robot 'mine' is neither" in said(2, "view", "unnamed.json")
 
 
@@ -146,7 +144,7 @@ def test_files_of_the_wrong_kind_name_the_right_command(tmp_path: Path, said: Sa
 
 def test_the_demo_of_another_arm_is_not_solved_by_the_straight_line() -> None:
     problem = shelf_problem("ur5e")
-    assert isinstance(problem.goal, JointGoal)
+    assert isinstance(problem.goal, rd.JointGoal)
     lines = [rd.Path(problem.robot.joint_names, np.stack([problem.start, q])) for q in problem.goal.positions]
     assert not any(rd.verify(problem, line).valid for line in lines)
 
@@ -161,8 +159,7 @@ def test_plan_ignores_joints_where_it_is_told_to(tmp_path: Path, said: Said) -> 
 
 def test_a_folder_and_degrees_are_named(tmp_path: Path, said: Said) -> None:
     assert ". is a folder" in said(2, "plan", ".")
-    degrees = write_problem(tmp_path, start=[0, -45, 0, -135, 0, 90, 45])
-    assert "(angles are in radians)" in said(2, "plan", degrees)
+    assert "(angles are in radians)" in said(2, "plan", write_problem(tmp_path, start=[0, -45, 0, -135, 0, 90, 45]))
 
 
 def test_plan_and_verify_name_allowed_contacts(tmp_path: Path, said: Said) -> None:

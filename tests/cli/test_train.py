@@ -14,7 +14,6 @@ from helpers.refusals import refuses
 from robotdiffuse.cli import train as train_command
 from robotdiffuse.cli.train import data_settings, train_for_robot
 from robotdiffuse.generation import factory
-from robotdiffuse.generation.factory import GenerationSettings
 from robotdiffuse.learning.denoisers import PAPER_SIZES, TransformerSettings
 from robotdiffuse.learning.training.config import CONFIGS, PlannerTraining, planner_training
 from robotdiffuse.learning.weight_files import user_weights, weights_for
@@ -86,7 +85,7 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
     monkeypatch.setattr(factory, "on_this_machine", in_this_process)
 
-    def few(*asked: object) -> GenerationSettings:
+    def few(*asked: object) -> factory.GenerationSettings:
         return replace(data_settings(*asked), mix={"rop": 1.0}, shard=4)  # type: ignore[arg-type]
 
     monkeypatch.setattr(train_command, "data_settings", few)
@@ -124,9 +123,8 @@ def test_bad_input_is_a_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert "give --robot to generate data" in error()
     assert "--data needs --out" in error("--data", str(tmp_path))
     assert "--trajectories is for data to be generated" in error("--data", tmp_path, "--out", "x", "--trajectories", 3)
-    full = type("Usage", (), {"free": 1_000_000})
     with monkeypatch.context() as patch:
-        patch.setattr(train_command.shutil, "disk_usage", lambda folder: full)
+        patch.setattr(train_command.shutil, "disk_usage", lambda folder: type("Usage", (), {"free": 1_000_000}))
         assert "free some space, or name another folder with --out" in error("--robot", "ur5e")
     (tmp_path / "half" / "data").mkdir(parents=True)
     (tmp_path / "half" / "data" / "manifest.json").write_text("{")

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from numpy import ndarray
 
 import robotdiffuse as rd
@@ -81,8 +80,7 @@ def test_every_shape_at_any_pose(kind: str, seed: int) -> None:
 def test_any_number_of_obstacles(count: int) -> None:
     """Obstacles are processed in groups of sixteen."""
     rng = np.random.default_rng(count)
-    kinds = ("sphere", "box", "cylinder", "capsule")
-    shapes = [oracles.random_shape(kinds[i % 4], rng) for i in range(count)]
+    shapes = [oracles.random_shape(("sphere", "box", "cylinder", "capsule")[i % 4], rng) for i in range(count)]
     far = [shape for shape in shapes if np.linalg.norm(shape.center) > 0.6]  # type: ignore[attr-defined]
     check_free(PANDA, rd.Scene(far), oracles.rows(PANDA, 600))
 
@@ -102,8 +100,7 @@ def test_links_with_any_number_of_spheres(count: int) -> None:
 
 def test_configurations_beyond_the_limits() -> None:
     """The tables of pairs of links do not cover these configurations, so the spheres decide."""
-    q = np.random.default_rng(0).uniform(2 * PANDA.lower, 2 * PANDA.upper, (4000, PANDA.dof))
-    check_free(PANDA, rd.Scene(), q)
+    check_free(PANDA, rd.Scene(), np.random.default_rng(0).uniform(2 * PANDA.lower, 2 * PANDA.upper, (4000, PANDA.dof)))
 
 
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17])
@@ -145,8 +142,7 @@ def test_a_huge_floor_is_as_exact_as_a_small_one(size: float) -> None:
     scene = rd.Scene([rd.Box((0.3, 0.1, -size / 2 - 0.05), (size + 4, size + 4, size))])
     lowest = [(c[..., 2] - r).min(axis=1) for c, r in zip(*oracles.sphere_centers(PANDA, q), strict=True)]
     right = np.stack(lowest[1:], axis=1) + 0.05
-    found = CollisionChecker(PANDA, scene).link_clearances(q)
-    np.testing.assert_allclose(found, np.minimum(right, 1), atol=3e-5)
+    np.testing.assert_allclose(CollisionChecker(PANDA, scene).link_clearances(q), np.minimum(right, 1), atol=3e-5)
 
 
 def test_long_poles_keep_their_precision() -> None:
@@ -167,8 +163,7 @@ def test_a_robot_without_spheres_is_free() -> None:
 
 def test_links_without_spheres_are_left_out_and_fixed_ones_do_not_count_against_the_scene() -> None:
     arm = box_arm()
-    robot = replace(arm, spheres={"l1": arm.spheres["l1"], "l3": np.zeros((0, 4))})
-    checker = CollisionChecker(robot, rd.Scene())
+    checker = CollisionChecker(replace(arm, spheres={"l1": arm.spheres["l1"], "l3": np.zeros((0, 4))}), rd.Scene())
     assert checker.links == ("l1",) and checker.pairs == () and checker.free(np.zeros((1, 3)))[0]
     checker = CollisionChecker(arm.with_locked({"j0": 0.0}), rd.Scene([rd.Sphere((0.2, 0, 0), 0.1)]))
     assert checker.links == ("l2", "l3") and checker.free(np.zeros((1, 2)))[0]

@@ -63,8 +63,7 @@ def test_gradients_are_those_of_the_clearances() -> None:
     near = too_close(at.detach()).numpy() > 1e-3
     far = clearances.min(axis=1) >= MARGIN
     assert near.sum() > 50 and far.sum() > 50
-    same = np.isclose(found[near], at.grad.numpy()[near], atol=2e-3).all(axis=1)
-    assert same.mean() > 0.95 and (found[far] == 0).all()
+    assert np.isclose(found[near], at.grad.numpy()[near], atol=2e-3).all(axis=1).mean() > 0.95 and (found[far] == 0).all()
 
 
 def test_gradients_of_a_cloud_are_those_of_what_it_covers() -> None:
@@ -77,8 +76,7 @@ def test_gradients_of_a_cloud_are_those_of_what_it_covers() -> None:
     # deep inside, the surface's points push elsewhere than the solid does
     touched = (right[0].min(axis=1) > 0.0) & (right[0].min(axis=1) < 0.09)
     assert touched.sum() > 50
-    close = np.isclose(found[1][touched], right[1][touched], atol=0.1).all(axis=1)
-    assert close.mean() > 0.9
+    assert np.isclose(found[1][touched], right[1][touched], atol=0.1).all(axis=1).mean() > 0.9
 
 
 def test_gradients_need_clearances() -> None:

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import robotdiffuse as rd
 from helpers.box_arm import HALF_WIDTH, box_arm
@@ -108,8 +107,7 @@ def test_a_mesh_is_its_surface() -> None:
 
 def test_nearest_honors_cutoffs_and_stops() -> None:
     exact = ExactCollision(box_arm(), rd.Scene([rd.Sphere((0.2, 0.5, 0), 0.1)]))
-    q = np.zeros((4, 3))
-    distances, names = exact.nearest(q, np.array([0, 0, 2, 0]), np.array([1.0, 0.2, 1.0, 1.0]), stop=0.3)
+    distances, names = exact.nearest(np.zeros((4, 3)), np.array([0, 0, 2, 0]), np.array([1.0, 0.2, 1.0, 1.0]), stop=0.3)
     assert distances[0] == pytest.approx(0.4 - HALF_WIDTH) and distances[1] == 0.2
     assert np.isnan(distances[2:]).all() and names == ["sphere", None, None, None]
 

@@ -95,10 +95,9 @@ def test_one_that_goes_faster_is_not_missed_between_rows() -> None:
 
 def test_validator_names_link_obstacle_and_time() -> None:
     ball = rd.MovingObstacle(rd.Sphere([0.45, -0.8, 0.5], 0.1, name="ball"), velocity=[0, 0.4, 0])
-    problem = rd.Problem(PANDA, rd.Scene(), START, START, moving=[ball])
     rows = np.tile(START, (2, 1))
     still = rd.Trajectory(PANDA.joint_names, np.array([0.0, 3.0]), rows, 0 * rows, 0 * rows)
-    violation = rd.verify(problem, still).violation
+    violation = rd.verify(rd.Problem(PANDA, rd.Scene(), START, START, moving=[ball]), still).violation
     assert violation is not None and (violation.kind, violation.other) == ("scene_collision", "ball")
     assert violation.subject in PANDA.link_names and 0.5 < violation.time < 3.0
     assert violation.message.endswith(f"at {violation.time:.3f} s")

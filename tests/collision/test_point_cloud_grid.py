@@ -38,10 +38,8 @@ def test_the_nearest_of_a_dense_cloud() -> None:
     robot = oracles.with_spheres("box_arm")
     points = np.random.default_rng(3).normal(size=(3000, 3))
     points = 0.4 * points / np.linalg.norm(points, axis=1, keepdims=True) + np.array([0.7, 0.5, 0])
-    cloud = thin_points(points, 0.004, 2.0)
-    scene = rd.Scene([rd.Sphere(c[:3], c[3]) for c in cloud])
     q = oracles.rows(robot, 200)
-    right = CollisionChecker(robot, scene)
+    right = CollisionChecker(robot, rd.Scene([rd.Sphere(c[:3], c[3]) for c in thin_points(points, 0.004, 2.0)]))
     found = CollisionChecker(robot, rd.Scene([rd.PointCloud(points, 0.004)]))
     np.testing.assert_array_equal(found.free(q), right.free(q))
     near = right.link_clearances(q) < 0.08
@@ -88,8 +86,7 @@ def test_links_with_spheres_larger_than_the_grids_band() -> None:
     free = cloud.free(q)
     assert 0 < free.mean() < 1 and ((oracles.least_clearance(cloud, q) > 0) == free).all()
     # no cost from points that are further away than the margin
-    clear = oracles.least_clearance(spheres, q) > 0.05
-    assert (cloud.cost_gradients(q[clear], 0.04)[0] == 0).all()
+    assert (cloud.cost_gradients(q[oracles.least_clearance(spheres, q) > 0.05], 0.04)[0] == 0).all()
 
 
 def test_mesh_obstacles_against_the_exact_surface() -> None:
@@ -100,14 +97,12 @@ def test_mesh_obstacles_against_the_exact_surface() -> None:
     q = np.random.default_rng(1).uniform(PANDA.lower, PANDA.upper, (1500, PANDA.dof))
     free = CollisionChecker(PANDA, scene).free(q)
     assert not ExactCollision(PANDA, scene).collides(q[free]).any()
-    solid = CollisionChecker(PANDA, rd.Scene([rd.Box(center, (0.3, 0.4, 0.5), wxyz)])).free(q)
-    assert (free == solid).mean() > 0.97
+    assert (free == CollisionChecker(PANDA, rd.Scene([rd.Box(center, (0.3, 0.4, 0.5), wxyz)])).free(q)).mean() > 0.97
 
 
 def test_a_ground_of_huge_triangles_is_as_fine_as_a_small_one() -> None:
     far = 1e4
-    vertices = np.array([[-far, -far, -0.2], [far, -far, -0.2], [0.0, 2 * far, -0.2]])
-    spheres = cover_triangles(vertices[None], 1.5)
+    spheres = cover_triangles(np.array([[-far, -far, -0.2], [far, -far, -0.2], [0.0, 2 * far, -0.2]])[None], 1.5)
     assert spheres[:, 3].max() < 0.03 and np.linalg.norm(spheres[:, :3], axis=1).max() < 2
     on_ground = np.array([[0.0, 0, -0.2], [1.2, 0.3, -0.2], [-0.5, -1.1, -0.2]])
     gap = np.linalg.norm(on_ground[:, None] - spheres[:, :3], axis=-1) - spheres[:, 3]

@@ -89,8 +89,7 @@ def test_a_body_inside_another_and_deep_overlaps_of_convex_parts_collide() -> No
     assert explain_collision(arm(wall, pin), EMPTY, BESIDE) == "l0 and l2 overlap by 4.0 mm"
     y = 0.5 * np.sin(TURN) + 0.02 + GAP
     deep = boxes(*(((x, y - 0.01, -0.05), (x + 0.02, y + 0.02, 0.05)) for x in (-0.62, 0.9)))
-    bar = boxes(((0.0, -0.02, -0.02), (0.3, 0.02, 0.02)))
-    assert between_links(arm(deep, bar), BESIDE) < -0.005
+    assert between_links(arm(deep, boxes(((0.0, -0.02, -0.02), (0.3, 0.02, 0.02)))), BESIDE) < -0.005
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -114,8 +113,7 @@ def test_a_motion_within_grazing_is_certified_or_refused_as_the_meshes_are() -> 
     along = np.stack([closer(0.0005), closer(0.0015), closer(0.004), [0.0, 0.0]])
     assert rd.verify(problem, rd.Path(robot.joint_names, along[:3])).valid
     mirrored = np.array([np.pi - TURN, TURN - np.pi])  # over the middle the arm reaches beyond the wall
-    through = rd.Path(robot.joint_names, np.stack([closer(0.0005), mirrored]))
-    assert rd.verify(problem, through).violation is not None
+    assert rd.verify(problem, rd.Path(robot.joint_names, np.stack([closer(0.0005), mirrored]))).violation is not None
 
 
 def test_proofs_refuse_grazing_and_name_the_pair() -> None:
@@ -160,9 +158,8 @@ def test_baxters_torso_and_arms_graze_as_trimesh_finds_too() -> None:
     robot = rd.load_robot("baxter_left")
     q = np.array([-1.5766, -0.088, -0.5168, 1.6863, -2.2078, -0.4002, 1.5902])
     links = ("torso", "left_lower_forearm")
-    by_parts = replace(robot, surfaces={}, grazing=frozenset())
     assert explain_collision(robot, EMPTY, q) is None
-    assert explain_collision(by_parts, EMPTY, q) is not None
+    assert explain_collision(replace(robot, surfaces={}, grazing=frozenset()), EMPTY, q) is not None
     [found] = [d for d in ExactCollision(robot, EMPTY).pair_distances(q) if {d.link, d.other} == {*links}]
     meshes = []
     for each in links:

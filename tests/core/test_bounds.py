@@ -59,8 +59,7 @@ def test_huge_shapes_are_never_called_valid(kind: type[Shape], distance: float) 
 
 
 def test_naming_is_not_quadratic() -> None:
-    scene = rd.Scene([rd.Sphere([0, 0, i], 0.1) for i in range(1000)])
-    names = [shape.name for shape in scene.shapes]
+    names = [shape.name for shape in rd.Scene([rd.Sphere([0, 0, i], 0.1) for i in range(1000)]).shapes]
     assert len({*names}) == 1000
     assert names[:3] == ["sphere", "sphere_2", "sphere_3"]
     mixed = rd.Scene([rd.Sphere([0, 0, 0], 1, name) for name in ("a", "a_2", "a", "a", "a_2")])

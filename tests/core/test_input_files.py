@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from numpy import ndarray
 from trimesh.exchange.gltf import export_gltf
 from trimesh.exchange.obj import export_obj

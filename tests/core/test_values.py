@@ -135,8 +135,7 @@ def test_large_arrays_are_shown_by_their_shape_and_defaults_not_at_all() -> None
 def test_nobody_can_write_to_the_arrays_of_a_value(kind: type[Value]) -> None:
     before = [array.copy() for array in GIVEN]
     value = VALUES[kind]()
-    again = pickle.loads(pickle.dumps(value)), copy.deepcopy(value), copy.copy(value)
-    for one in (value, *again):
+    for one in (value, pickle.loads(pickle.dumps(value)), copy.deepcopy(value), copy.copy(value)):
         for name, array in arrays(one):
             assert not array.flags.writeable, name
             if array.size:
@@ -159,9 +158,8 @@ def test_views_of_what_can_be_written_to_are_copied() -> None:
 
 def test_a_verdict_is_of_the_scene_as_it_is() -> None:
     """A sphere cannot be moved into a motion that was found free."""
-    path = rd.Path(box_arm().joint_names, ROWS)
     task = rd.Problem(box_arm(), rd.Scene([rd.Sphere([-1, 0, 0], 0.1)]), ROWS[0], ROWS[1])
-    assert rd.verify(task, path).valid
+    assert rd.verify(task, rd.Path(box_arm().joint_names, ROWS)).valid
     with pytest.raises(ValueError, match="read-only"):
         task.scene.shapes[0].center[:] = 0.5, 0.1, 0.0  # type: ignore[attr-defined]
     with pytest.raises(ValueError, match="read-only"):

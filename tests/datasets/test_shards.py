@@ -105,9 +105,8 @@ def test_a_full_disk(tmp_path, arrays, monkeypatch):
 @later
 def rewrite(store, name, change):
     group = zarr.open_group(shards.shard_path(store, 0), mode="a")
-    prints = dict(group[name].attrs)
     data = change(zarr.open_array(shards.shard_path(store, 0) / name)[...])
-    group.create_array(name, data=data, chunks=data.shape, attributes=prints, overwrite=True)
+    group.create_array(name, data=data, chunks=data.shape, attributes=dict(group[name].attrs), overwrite=True)
 
 
 def chunk(store, name):

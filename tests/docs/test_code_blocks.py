@@ -54,9 +54,8 @@ def test_a_page_that_starts_processes_runs_as_one_script(tmp_path: Path) -> None
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     for text in guarded.values():
         (tmp_path / "page.py").write_text(text, encoding="utf-8")
-        command = [sys.executable, "page.py"]
         paths = os.environ | {"PYTHONPATH": str(ROOT / "src")}
-        done = subprocess.run(command, cwd=tmp_path, env=paths, capture_output=True, text=True)
+        done = subprocess.run([sys.executable, "page.py"], cwd=tmp_path, env=paths, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         assert sum(line.startswith("solved ") for line in done.stdout.splitlines()) >= 2, done.stdout
 

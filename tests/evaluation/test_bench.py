@@ -19,7 +19,6 @@ from helpers.commands import Said
 from helpers.refusals import refuses
 from robotdiffuse.cli import main
 from robotdiffuse.core import registry
-from robotdiffuse.core.registry import Entry
 from robotdiffuse.evaluation import bench
 from robotdiffuse.evaluation.bench_comparisons import LATE_SECONDS
 from robotdiffuse.evaluation.metrics import METRICS
@@ -94,7 +93,7 @@ def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path, 
 
 
 def test_a_planner_of_the_program_itself_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PLANNERS, "mine", Entry("__main__:Mine", "for tests"))
+    monkeypatch.setitem(PLANNERS, "mine", registry.Entry("__main__:Mine", "for tests"))
     refuses("planner mine is in the program that was started", bench.run_bench, settings(tmp_path, "mine"), quiet, quiet)
 
 
@@ -206,8 +205,7 @@ def test_planners_take_turns_with_each_problem(tmp_path: Path, monkeypatch: pyte
     assert bench.run_bench(replace(settings(tmp_path / "b", planners), workers=2), quiet, quiet) == 9
     assert most == [2]
     for name in planners.split(","):
-        records = read_records(tmp_path / "b")[name]
-        assert [record.name for record in records] == [f"rop/{i}" for i in range(3)]
+        assert [record.name for record in read_records(tmp_path / "b")[name]] == [f"rop/{i}" for i in range(3)]
 
 
 def test_a_planner_with_settings_or_weights_of_the_package() -> None:
@@ -275,12 +273,10 @@ def test_other_problems_of_the_same_name_are_refused(tmp_path: Path) -> None:
     for folder, line in zip("ab", lines, strict=True):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "mine.jsonl").write_text(line)
-    first = str(tmp_path / "a" / "mine.jsonl")
-    other = str(tmp_path / "b" / "mine.jsonl")
     for _ in range(2):
-        assert len(gather_cases([first], None, tmp_path / "out", quiet)) == 1
+        assert len(gather_cases([str(tmp_path / "a" / "mine.jsonl")], None, tmp_path / "out", quiet)) == 1
     with pytest.raises(rd.InputError, match=r"problems called mine that were read from .*; those in .* another content"):
-        gather_cases([other], None, tmp_path / "out", quiet)
+        gather_cases([str(tmp_path / "b" / "mine.jsonl")], None, tmp_path / "out", quiet)
     (tmp_path / "rop.jsonl").write_text(lines[0])
     refuses("a is an input of this command", gather_cases, [str(tmp_path / "a")], None, tmp_path / "a", quiet)
     refuses("have the name of the family rop", gather_cases, [str(tmp_path / "rop.jsonl")], None, tmp_path / "out", quiet)

@@ -312,8 +312,7 @@ def test_the_command_writes_everything_also_to_a_folder_that_does_not_exist(smal
     for name in plots:
         assert ElementTree.parse(out / name).getroot().tag.endswith("svg")
     said(0, "bench", "report", small, "--out", tmp_path / "new" / "report")
-    written = {file.name for file in (tmp_path / "new" / "report").iterdir()}
-    assert {"index.html", "replays.html", "report.md"} < written
+    assert {"index.html", "replays.html", "report.md"} < {file.name for file in (tmp_path / "new" / "report").iterdir()}
 
 
 def test_no_legend_or_name_is_clipped() -> None:

@@ -5,8 +5,7 @@ from math import comb
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy.integrate import quad
 
 import robotdiffuse as rd
@@ -104,8 +103,7 @@ def test_interrupted_and_shaking_motions_are_less_smooth() -> None:
 
 @pytest.mark.parametrize("rows", [np.zeros((1, 2)), np.zeros((2, 2)), np.ones((5, 2))])
 def test_a_motion_that_stands_still_has_figures(rows: np.ndarray) -> None:
-    times = np.linspace(0, 0.01 * (len(rows) - 1), len(rows))
-    motion = rd.Trajectory(("j0", "j1"), times, rows, 0 * rows, 0 * rows)
+    motion = rd.Trajectory(("j0", "j1"), np.linspace(0, 0.01 * (len(rows) - 1), len(rows)), rows, 0 * rows, 0 * rows)
     found = metrics.measured(ARM, rd.Path(motion.joint_names, rows), motion)
     assert found.pop("duration") == motion.duration
     assert set(found) >= {"joint_length", "link_length", "turning", "bending", "jerk", "sparc_tip"}
@@ -115,9 +113,8 @@ def test_a_motion_that_stands_still_has_figures(rows: np.ndarray) -> None:
 def test_clearance_to_the_scene_and_to_itself_apart() -> None:
     rows = np.stack([HOME, HOME + 0.01])
     ball = rd.Sphere(PANDA.fk(HOME, "panda_link4")[:3, 3] + np.array([0, 0, 0.4]), 0.1)
-    problem = rd.Problem(PANDA, rd.Scene([ball]), HOME, rows[1])
     path = rd.Path(PANDA.joint_names, rows)
-    verdict = rd.verify(problem, path)
+    verdict = rd.verify(rd.Problem(PANDA, rd.Scene([ball]), HOME, rows[1]), path)
     found = metrics.measured(PANDA, path, None, verdict)
     apart = found["scene_clearance"], found["self_clearance"]
     assert apart == pytest.approx((verdict.scene_clearance, verdict.self_clearance), rel=1e-6)
@@ -125,9 +122,7 @@ def test_clearance_to_the_scene_and_to_itself_apart() -> None:
     assert "scene_clearance" not in metrics.measured(PANDA, path)
 
 
-@pytest.mark.parametrize(
-    ("shift", "angle", "kind"), [(0.009, 0.0, ""), (0.011, 0.0, "goal"), (0.0, 14.0, ""), (0.0, 16.0, "goal")]
-)
+@pytest.mark.parametrize(("shift", "angle", "kind"), [(0.009, 0, ""), (0.011, 0, "goal"), (0, 14, ""), (0, 16, "goal")])
 def test_one_centimeter_and_fifteen_degrees_are_settings(shift: float, angle: float, kind: str) -> None:
     axis = np.array([0.6, 0.0, 0.8])
     T = PANDA.fk(END, "panda_hand")

@@ -29,9 +29,8 @@ ROW_NAMES = {row.paper: row.name for row in paper.ROWS if row.paper}
 
 def test_scores_are_the_papers_and_further_rows_replace_its_method() -> None:
     of = {ROW_NAMES[row.name]: row.indicators for row in paper.PAPER_TABLE_1}
-    printed = comscores([row.indicators for row in paper.PAPER_TABLE_1])
     found = paper.scores(paper.ROWS, of | {"aorrtc": Indicators(100.0, 0.0, 14.0, 1.0)})
-    for row, score in zip(paper.PAPER_TABLE_1, printed, strict=True):
+    for row, score in zip(paper.PAPER_TABLE_1, comscores([row.indicators for row in paper.PAPER_TABLE_1]), strict=True):
         assert found[ROW_NAMES[row.name]] == pytest.approx(score)
     assert found["aorrtc"] == 1.0  # the best in all four
 

@@ -30,7 +30,6 @@ from robotdiffuse.core.transforms import rotation_from_quaternion
 from robotdiffuse.datasets.shards import check_shard, path_of, problem_of, read_manifest, read_shard
 from robotdiffuse.generation import GenerationSettings, factory, generate
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
-from robotdiffuse.generation.factory import PROBLEMS_PER_SHARD, draw, make_shard, solve
 from robotdiffuse.robots import names_a_file
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
@@ -94,11 +93,11 @@ def test_shards_are_whole_and_what_the_manifest_says(folder: Path) -> None:
         assert counts["solved"] == 4 and counts.pop("tried") == sum(counts.values())
         # numbers of problems rise, and no other shard has them
         assert (np.diff(shard["seed"].astype(np.int64)) > 0).all()
-        assert (shard["seed"] // PROBLEMS_PER_SHARD == index).all()
+        assert (shard["seed"] // factory.PROBLEMS_PER_SHARD == index).all()
 
 
 def checked_problem(row: dict[str, Any]) -> tuple[rd.Problem, CollisionChecker]:
-    number, drawn = draw(SETTINGS, PANDA, np.random.default_rng([SETTINGS.seed, int(row["seed"])]))
+    number, drawn = factory.draw(SETTINGS, PANDA, np.random.default_rng([SETTINGS.seed, int(row["seed"])]))
     assert row["family"] == number
     floor = list(SETTINGS.families.values())[number].floor
     packed = PackedScenes.pack([drawn.scene], SETTINGS.slots, floor is not None)
@@ -117,9 +116,8 @@ def test_every_trajectory_is_what_it_claims_to_be(i: int, rows: dict[str, ndarra
     row: dict[str, Any] = {name: values[i] for name, values in rows.items()}
     problem, checker = checked_problem(row)
     q = np.array(row["trajectories"])
-    goal = row["goals"][row["goal_index"]]
     np.testing.assert_array_equal(q[0], row["start"])
-    np.testing.assert_array_equal(q[-1], goal)
+    np.testing.assert_array_equal(q[-1], row["goals"][row["goal_index"]])
     assert ((q >= PANDA.lower - 1e-6) & (q <= PANDA.upper + 1e-6)).all()
     assert rd.verify(problem, rd.Path(PANDA.joint_names, q.astype(float))).valid
     fine = np.concatenate([a + np.linspace(0, 1, 20)[:, None] * (b - a) for a, b in pairwise(q)])
@@ -149,7 +147,7 @@ def test_every_trajectory_is_what_it_claims_to_be(i: int, rows: dict[str, ndarra
 @pytest.mark.parametrize("target", ["position", "pose"])
 def test_the_target_holds_for_all_goals(target: str, rows: dict[str, ndarray]) -> None:
     if target == "pose":
-        rows, _ = make_shard(replace(SETTINGS, trajectories=3, target="pose"), 0)
+        rows, _ = factory.make_shard(replace(SETTINGS, trajectories=3, target="pose"), 0)
     several = 0
     for goals, wanted in zip(rows["goals"], rows["target_pose"], strict=True):
         poses = [PANDA.fk(q.astype(float), PANDA.tip) for q in goals if np.isfinite(q).all()]
@@ -163,18 +161,18 @@ def test_the_target_holds_for_all_goals(target: str, rows: dict[str, ndarray]) -
 
 def test_thinning_leaves_out_what_the_line_solves_and_nothing_else() -> None:
     whole = replace(SETTINGS, trajectories=8, shard=8, mix={"rop_dense": 1.0})
-    arrays, counts = make_shard(whole, 0)
+    arrays, counts = factory.make_shard(whole, 0)
     assert counts["thinned"] == 0
     hard = ~arrays["line_free"]
     assert 0 < hard.sum() < 8
-    thin, counts = make_shard(replace(whole, trajectories=int(hard.sum()), trivial_share=0.0), 0)
+    thin, counts = factory.make_shard(replace(whole, trajectories=int(hard.sum()), trivial_share=0.0), 0)
     assert counts["thinned"] > 0
     for name, values in arrays.items():
         np.testing.assert_array_equal(thin[name], values[hard], err_msg=name)
 
 
 def test_frames_in_time_keep_the_velocity_limits() -> None:
-    arrays, _ = make_shard(replace(SETTINGS, trajectories=3, timing="time"), 0)
+    arrays, _ = factory.make_shard(replace(SETTINGS, trajectories=3, timing="time"), 0)
     times = arrays["times"].astype(float)
     q = arrays["trajectories"].astype(float)
     assert times.shape == (3, 32) and (times[:, 0] == 0).all() and (np.diff(times) > 0).all()
@@ -273,9 +271,9 @@ AORRTC = GenerationSettings(
 def test_motions_are_free_reach_a_goal_and_keep_their_distance(name: str) -> None:
     settings = replace(AORRTC, robot=name, trajectories=3)
     robot = rd.load_robot(name)
-    arrays, _ = make_shard(settings, 0)
+    arrays, _ = factory.make_shard(settings, 0)
     for row in (dict(zip(arrays, values, strict=True)) for values in zip(*arrays.values(), strict=True)):
-        drawn = draw(settings, robot, np.random.default_rng([settings.seed, int(row["seed"])]))[1]
+        drawn = factory.draw(settings, robot, np.random.default_rng([settings.seed, int(row["seed"])]))[1]
         q = np.asarray(row["trajectories"], np.float64)
         assert rd.verify(drawn.problem(robot), rd.Path(robot.joint_names, q)).valid
         np.testing.assert_array_equal(q[-1], row["goals"][row["goal_index"]])
@@ -293,10 +291,10 @@ def test_goals_a_turn_away_are_taken_the_short_way() -> None:
     settings = GenerationSettings(robot="ur5e", mix={"rop": 1.0}, target="pose", goals=1, waypoints=16)
     turning = robot.upper - robot.lower > 2 * np.pi + 0.1
     for number in range(60):
-        drawn = draw(settings, robot, np.random.default_rng([settings.seed, number]))[1]
+        drawn = factory.draw(settings, robot, np.random.default_rng([settings.seed, number]))[1]
         if np.abs(drawn.goals[0] - drawn.start)[turning].max() > np.pi:
             far.append(number)
-            row = solve(settings, robot, number)
+            row = factory.solve(settings, robot, number)
             assert row != "refused"
             if not isinstance(row, str):
                 assert np.abs(np.asarray(row["goals"])[0] - drawn.start)[turning].max() <= np.pi + 1e-6

@@ -50,8 +50,7 @@ def degenerate() -> trimesh.Trimesh:
     """A mesh with triangles of no area, repeated corners, and points that belong to no triangle."""
     mesh = box()
     faces = np.concatenate([mesh.faces, [[0, 0, 1], [2, 2, 2], [0, 1, 0]]])
-    vertices = np.concatenate([mesh.vertices, mesh.vertices[:2], [[0.0, 0.0, 0.0]]])
-    return trimesh.Trimesh(vertices, faces, process=False)
+    return trimesh.Trimesh(np.concatenate([mesh.vertices, mesh.vertices[:2], [[0.0, 0.0, 0.0]]]), faces, process=False)
 
 
 def fine() -> trimesh.Trimesh:

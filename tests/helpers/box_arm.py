@@ -17,8 +17,7 @@ def box_mesh(low: ndarray, high: ndarray) -> ConvexMesh:
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low
     hull = ConvexHull(corners)
     outward = np.linalg.det(np.stack([corners[f] - corners.mean(0) for f in hull.simplices])) > 0
-    faces = np.where(outward[:, None], hull.simplices, hull.simplices[:, ::-1])
-    return ConvexMesh(corners, faces.astype(np.int64))
+    return ConvexMesh(corners, np.where(outward[:, None], hull.simplices, hull.simplices[:, ::-1]).astype(np.int64))
 
 
 @cache

@@ -98,10 +98,9 @@ def urdf_file(name: str, folder: Path) -> Path:
 
 @cache
 def example_robot(name: str) -> Robot:
-    base = "base" if name == "awkward" else None
     with TemporaryDirectory() as folder:
         group, tip = ("both", None) if name == "two_arms" else (None, TIPS[name])
-        return read_urdf(urdf_file(name, Path(folder)), base=base, tip=tip, group=group)
+        return read_urdf(urdf_file(name, Path(folder)), base="base" if name == "awkward" else None, tip=tip, group=group)
 
 
 def planar_arm(*lengths: float) -> Robot:

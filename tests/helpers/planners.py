@@ -11,8 +11,7 @@ import numpy as np
 from robotdiffuse import InputError, PlanResult, Problem, Robot
 from robotdiffuse.planning import Entry
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
-from robotdiffuse.planning.search.rrt import AORRTC, RRTConnect
-from robotdiffuse.planning.search.rrt import RRTConnectSettings as RRTConnectSettings
+from robotdiffuse.planning.search.rrt import AORRTC, RRTConnect, RRTConnectSettings as RRTConnectSettings
 from robotdiffuse.planning.start_goal import StartGoal
 
 SOLVES, RAISES, DIES, HANGS, TALKS, SEARCHES, EXITS, EATS, KEEPS = range(9)

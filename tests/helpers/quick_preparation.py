@@ -9,11 +9,10 @@ from robotdiffuse.robots.fitting import sphere_fitting
 from robotdiffuse.robots.fitting.convex_parts import PartSettings
 from robotdiffuse.robots.fitting.preparation import PreparationSettings
 from robotdiffuse.robots.fitting.self_collisions import SamplingSettings
-from robotdiffuse.robots.fitting.sphere_fitting import SphereSettings
 
 QUICK = PreparationSettings(
     parts=PartSettings(voxels=20_000, faces=60, rounding=2e-3),
-    spheres=SphereSettings(first_half=0.03, second_half=0.03, candidates=200, rounds=2),
+    spheres=sphere_fitting.SphereSettings(first_half=0.03, second_half=0.03, candidates=200, rounds=2),
     sampling=SamplingSettings(samples=100, descents=1),
     samples=100,
     rounds=0,

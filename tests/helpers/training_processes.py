@@ -43,9 +43,8 @@ def two(settings: PlannerTraining, out: Path) -> None:
     except KeyboardInterrupt:
         TrainingRun.step = original
     again = training.train_planner(settings, str(out / "parts"))
-    seen = {"report": report, "again": again} | bad_step_in_one(str(out / "toy"))
     processes = Processes("cpu")
-    found = processes.gather(seen)
+    found = processes.gather({"report": report, "again": again} | bad_step_in_one(str(out / "toy")))
     if processes.first:
         (out / "seen.json").write_text(json.dumps(found))
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
 
 from robotdiffuse.learning.training.config import TrainingSettings
 from robotdiffuse.learning.training.loop import Processes, TrainingTask, Validation
@@ -27,7 +26,7 @@ class ToyTask(TrainingTask):
         self._factor = factor
         self._calls = 0
 
-    def loss(self, fraction: float, rng: np.random.Generator) -> Tensor:
+    def loss(self, fraction: float, rng: np.random.Generator) -> torch.Tensor:
         self._calls += 1
         return (self.module.get_parameter("weight") * self._factor(self._calls - 1)).square().sum()
 
@@ -44,7 +43,7 @@ def read_log(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def trained(network: nn.Module, loss_at: Callable[[int], Tensor], steps: int, rate: float) -> list[float]:
+def trained(network: torch.nn.Module, loss_at: Callable[[int], torch.Tensor], steps: int, rate: float) -> list[float]:
     """The loss of each step of a training; `loss_at` gives the loss for the number of a step."""
     optimizer = torch.optim.AdamW(network.parameters(), rate)
     losses = []

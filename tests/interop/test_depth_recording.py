@@ -17,7 +17,6 @@ from helpers.explorations import FLOOR, HOME, WALL
 from helpers.refusals import refuses
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.interop import depth_recording, ros2
-from robotdiffuse.interop.ros2 import JOINT_STATE, McapWriter, to_message, typestore
 from robotdiffuse.perception.occupancy_map import OccupancyMap
 from robotdiffuse.planning.exploration.simulated import RecordedExplorer, camera_beside, explore, wrist_camera
 
@@ -49,7 +48,7 @@ def test_a_recorded_exploration_is_read_again_and_gives_the_same_voxels(tmp_path
 
 
 KINDS = {
-    "/joint_states": JOINT_STATE,
+    "/joint_states": ros2.JOINT_STATE,
     "/tf": depth_recording.TRANSFORMS,
     "/tf_static": depth_recording.TRANSFORMS,
     "/camera/camera_info": depth_recording.CAMERA_INFO,
@@ -95,7 +94,7 @@ def recording(file: Path, change: Callable[[dict[str, Any]], object] = lambda me
     each = [(topic, KINDS[topic], content) for topic, contents in messages.items() for content in contents]
     if file.suffix == ".mcap":
         with file.open("wb") as stream:
-            out = McapWriter(stream)
+            out = ros2.McapWriter(stream)
             for topic, kind, content in each:
                 out.ros(topic, kind, content, 10**9)
             out.writer.finish()
@@ -105,7 +104,7 @@ def recording(file: Path, change: Callable[[dict[str, Any]], object] = lambda me
 
 
 def write_bag(bag: Writer1 | Writer2, messages: list[tuple[str, str, Any]]) -> None:
-    store = typestore()
+    store = ros2.typestore()
     if isinstance(bag, Writer1):
         store = get_typestore(Stores.ROS1_NOETIC)
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", depth_recording.TRANSFORMS))
@@ -117,7 +116,7 @@ def write_bag(bag: Writer1 | Writer2, messages: list[tuple[str, str, Any]]) -> N
         }
         serialized = store.serialize_ros1 if isinstance(bag, Writer1) else store.serialize_cdr
         for topic, kind, content in messages:
-            writer.write(connections[topic], 10**9, serialized(to_message(kind, content), kind))
+            writer.write(connections[topic], 10**9, serialized(ros2.to_message(kind, content), kind))
 
 
 def test_poses_and_configurations_are_interpolated_and_millimeters_read(tmp_path: Path) -> None:

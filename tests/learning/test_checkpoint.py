@@ -49,8 +49,7 @@ def test_wrong_robot_is_refused(tmp_path):
 
 @later
 def weights(folder, change):
-    data = (folder / "model.safetensors").read_bytes()
-    (folder / "model.safetensors").write_bytes(change(data))
+    (folder / "model.safetensors").write_bytes(change((folder / "model.safetensors").read_bytes()))
 
 
 @later

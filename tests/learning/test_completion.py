@@ -57,8 +57,7 @@ def test_training_begins_with_the_weights_that_it_is_given() -> None:
 
 
 def test_voxels_pack_and_unpack() -> None:
-    scene = load_family("table").scene(np.random.default_rng(0))
-    fine = voxels_within(scene, FINE)
+    fine = voxels_within(load_family("table").scene(np.random.default_rng(0)), FINE)
     bits = completion.unpack_fine(completion.pack_fine(fine))
     for place in np.argwhere(bits.any(axis=-1))[::97]:
         for bit in range(8):
@@ -119,8 +118,7 @@ def test_training_writes_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 def test_training_is_resumed_exactly_with_and_without_prefetching(tmp_path: Path) -> None:
     report = training.train_completion(TINY, str(tmp_path / "whole"))
     training.train_completion(replace(TINY, samples=4), str(tmp_path / "parts"))
-    again = training.train_completion(TINY, str(tmp_path / "parts"))
-    assert again.keys() == report.keys() and report["samples"] == 8
+    assert training.train_completion(TINY, str(tmp_path / "parts")).keys() == report.keys() and report["samples"] == 8
     whole = load_completion(tmp_path / "whole")
     assert whole.temperature > 0 and not any(p.requires_grad for p in whole.parameters())
     rng = np.random.default_rng(2)
@@ -162,10 +160,9 @@ def test_bundled_weights_are_better_than_a_constant(family: str) -> None:
     network = completion.exported_completion()
     above = completion.voxel_centers()[..., 2] > 0.02
     p = [network(*volume) for volume in zip(samples.seen, samples.behind, strict=True)]
-    truth = completion.unpack_fine(samples.truth)
     counted = ((samples.seen & (completion.FREE | completion.OCCUPIED)) == 0) & completion.reachable() & above
     stated = np.stack([completion.unpack_fine(completion.pack_fine(one > 0.1)) for one in p])
     called = stated[counted]
-    true = truth[counted]
+    true = completion.unpack_fine(samples.truth)[counted]
     assert called[true].mean() > 0.4, "recall"
     assert true[called].mean() > 3 * true.mean(), "precision"

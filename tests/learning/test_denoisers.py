@@ -147,9 +147,8 @@ def model_with(name: str, null_condition: bool = False) -> MotionNetwork:
 
 def sample(model: MotionModel, scale: float = 1.0) -> np.ndarray:
     ends = np.array([-1.0, 0.5, 2.0]), np.array([1.5, -0.5, 0.1])
-    code = np.ones(model.settings.code, np.float32)
     settings = SamplingSettings(samples=3, sampling_steps=3, guidance_scale=scale)
-    return model.sample(*ends, code, nothing_near, np.random.default_rng(0), settings)
+    return model.sample(*ends, np.ones(model.settings.code, np.float32), nothing_near, np.random.default_rng(0), settings)
 
 
 @pytest.mark.slow

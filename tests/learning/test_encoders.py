@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from helpers.box_arm import box_arm
 from helpers.commands import Said
@@ -18,7 +17,6 @@ from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning import encoders
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_network, save_network
 from robotdiffuse.learning.denoisers import CrossAttentionSettings, TransformerSettings
-from robotdiffuse.learning.encoders import networks
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
@@ -51,9 +49,8 @@ def small(name, seed=0):
 
 
 def cloud(n, batch=1, seed=0):
-    generator = torch.Generator().manual_seed(seed)
     low, size = torch.tensor([[-0.5, -0.5, 0.1], [1.0, 1.0, 0.8]])
-    return low + size * torch.rand(batch, n, 3, generator=generator)
+    return low + size * torch.rand(batch, n, 3, generator=torch.Generator().manual_seed(seed))
 
 
 def denoiser_for(encoder: str) -> dict[str, Any]:
@@ -116,7 +113,7 @@ def test_gradients_reach_every_parameter(name):
     clouds = torch.cat([cloud(40, 6), torch.zeros(2, 40, 3)])
     clouds[5, 2:] = 0.0
     loss = encoder(clouds).square().sum() + encoder(0 * clouds[:, :1]).square().sum()
-    if isinstance(encoder, networks.Autoencoder):
+    if isinstance(encoder, encoders.networks.Autoencoder):
         loss = loss + encoder.loss(clouds, np.random.default_rng(0))[0]
     loss.backward()
     for parameter, p in encoder.named_parameters():
@@ -127,7 +124,7 @@ def test_gradients_reach_every_parameter(name):
 @every_encoder
 def test_files(name, tmp_path):
     encoder = small(name)
-    if isinstance(encoder, networks.Autoencoder):
+    if isinstance(encoder, encoders.networks.Autoencoder):
         with torch.no_grad():
             encoder.standardize(encoder.encode(cloud(40, 30)))
     save_network("encoder", encoder, tmp_path, {})
@@ -169,12 +166,12 @@ def test_arranged_clouds():
 def test_edge_convolution_is_the_maximum_over_edges():
     """Compares with the layer as in the paper, computed edge by edge."""
     torch.manual_seed(0)
-    layer = networks.EdgeConvolution(5, 7, 4)
-    few = networks.neighbors(torch.tensor([[[0.0], [1.0], [3.0], [1.1]]]), torch.arange(4)[None] < 3, 4)[0]
+    layer = encoders.networks.EdgeConvolution(5, 7, 4)
+    few = encoders.networks.neighbors(torch.tensor([[[0.0], [1.0], [3.0], [1.1]]]), torch.arange(4)[None] < 3, 4)[0]
     assert [set(row.tolist()) for row in few] == [{0, 1, 2}] * 3 + [{0, 1, 2, 3}]
     x = torch.randn(2, 12, 5)
     near = torch.ones(2, 12, dtype=torch.bool)
-    index = networks.neighbors(x, near, 4)
+    index = encoders.networks.neighbors(x, near, 4)
     for b in range(2):
         apart = torch.cdist(x[b], x[b])
         for i in range(12):
@@ -242,9 +239,8 @@ def planner(data, encoder, **changes) -> PlannerTraining:
 @pytest.mark.slow
 @every_encoder
 def test_joint_training_changes_the_encoder(name, data, tmp_path):
-    planned = planner(data, name, encoder_settings=SMALL[name], learning_rate=1e-2)
     fresh = small(name)
-    train_planner(planned, str(tmp_path / "out"))
+    train_planner(planner(data, name, encoder_settings=SMALL[name], learning_rate=1e-2), str(tmp_path / "out"))
     model = load_network("model", tmp_path / "out", box_arm())
     assert model.encoder is not None and type(model.encoder) is encoders.ENCODERS.load(name)
     trained = dict(model.encoder.named_parameters())

@@ -52,8 +52,7 @@ def test_bundled_denoisers(name: str, batch: int) -> None:
 @pytest.mark.parametrize("points", [0, 1, 320, 5000])
 def test_bundled_encoder(points: int) -> None:
     cloud = np.random.default_rng(points).uniform(-0.7, 0.7, (points, 3))
-    exported = exported_model("model", None, PANDA)
-    assert_same(exported.encode(cloud), load_network("model", None, PANDA).encode(cloud))
+    assert_same(exported_model("model", None, PANDA).encode(cloud), load_network("model", None, PANDA).encode(cloud))
 
 
 def test_bundled_completion_network() -> None:

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from numpy import ndarray
 
 import robotdiffuse as rd
@@ -16,8 +15,6 @@ from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.constraint_kernel import DISTANCE
 from robotdiffuse.problems.constraints import Constraint
 from robotdiffuse.problems.projection_kernel import ANGLE_WEIGHT
-from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
 
 WAYPOINTS = 24
@@ -28,10 +25,9 @@ def straight(start: ndarray, goal: ndarray, waypoints: int = WAYPOINTS) -> ndarr
 
 
 def swing() -> tuple[CollisionChecker, ndarray]:
-    checker = CollisionChecker(box_arm(), Scene([Sphere((1.02, 0.55, 0.0), 0.08)]))
+    checker = CollisionChecker(box_arm(), rd.Scene([Sphere((1.02, 0.55, 0.0), 0.08)]))
     through = straight(np.array([-0.8, 0.6, 0.6]), np.array([0.8, 0.6, 0.6]))
-    clear = straight(np.array([1.2, 0.2, 0.1]), np.array([2.0, 0.1, 0.4]))
-    return checker, np.stack([through, clear])
+    return checker, np.stack([through, straight(np.array([1.2, 0.2, 0.1]), np.array([2.0, 0.1, 0.4]))])
 
 
 def test_steps_take_a_motion_out_of_collision_and_leave_others_and_ends() -> None:
@@ -63,9 +59,9 @@ ALONE = {
     "length": replace(NOTHING, length=1.0),
 }
 """Each cost as the only one, in steps of moderate size."""
-PANDA = load_robot("panda")
+PANDA = rd.load_robot("panda")
 CROWDED = CollisionChecker(
-    PANDA, Scene([Sphere([0.45, 0.1, 0.5], 0.2), Box([0.0, 0.5, 0.4], [0.3, 0.2, 0.3]), Sphere([-0.4, -0.3, 0.4], 0.2)])
+    PANDA, rd.Scene([Sphere([0.45, 0.1, 0.5], 0.2), Box([0.0, 0.5, 0.4], [0.3, 0.2, 0.3]), Sphere([-0.4, -0.3, 0.4], 0.2)])
 )
 
 
@@ -81,9 +77,8 @@ def random_motions(seed: int, count: int = 4, waypoints: int = 32) -> ndarray:
 
 def formulas(guidance: CollisionGuidance, q: ndarray) -> dict[str, ndarray]:
     """The enabled costs of trajectories [count, waypoints, dof], [count]: in rad²; costs of collision in m²."""
-    margins = {"collision": guidance.settings.margin, "self_collision": guidance.settings.self_margin}
     found = {"length": 0.5 * (np.diff(q, axis=1) ** 2).sum((1, 2))}
-    for name, margin in margins.items():
+    for name, margin in {"collision": guidance.settings.margin, "self_collision": guidance.settings.self_margin}.items():
         if margin is not None:
             both = (margin, float(OFF)) if name == "collision" else (float(OFF), margin)
             costs, _ = guidance.checker.cost_gradients(q.reshape(-1, q.shape[2]), *both)
@@ -180,9 +175,8 @@ def test_steps_go_down_until_all_waypoints_keep_it(constraint: Constraint) -> No
     before = constraint_cost(constraints, 0.95, q)
     off = before > 0
     assert off.sum() >= 3
-    once = guidance(q, 1)[0]
     many = guidance(q, 30)[0]
-    assert (constraint_cost(constraints, 0.95, once) < before)[off].all()
+    assert (constraint_cost(constraints, 0.95, guidance(q, 1)[0]) < before)[off].all()
     np.testing.assert_array_equal(many[:, [0, -1]], q[:, [0, -1]])
     assert constraints.satisfied(many.reshape(-1, PANDA.dof).astype(np.float64)).all()
 

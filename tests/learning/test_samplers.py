@@ -160,10 +160,8 @@ def test_objectives_weigh_levels_alike(name, limit):
     schedule = cosine_schedule()
     objective = OBJECTIVES[name]
     t = np.arange(1, 200)
-    a = schedule.signal[t]
-    s = schedule.noise[t]
     weight = objective.weight(schedule, t, limit)
-    moved = objective.clean(np.zeros(199), np.ones(199), a, s)  # by an error of 1, as x_t is 0
+    moved = objective.clean(np.zeros(199), np.ones(199), schedule.signal[t], schedule.noise[t])  # by an error of 1, as x_t is 0
     wanted = schedule.weight(t, limit)
     free = weight < limit
     assert free.sum() > 50

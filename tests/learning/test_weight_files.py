@@ -27,9 +27,8 @@ def test_a_pipe_a_link_to_a_device_and_a_nested_description_are_not_read(tmp_pat
 def test_a_network_reads_no_other_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Regression: ONNX Runtime read weights from a file in the current folder."""
     onnx = pytest.importorskip("onnx")
-    number = onnx.TensorProto.FLOAT
     weights = onnx.numpy_helper.from_array(np.ones(4, np.float32), "w")
-    x, y = (onnx.helper.make_tensor_value_info(name, number, [4]) for name in "xy")
+    x, y = (onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [4]) for name in "xy")
     graph = onnx.helper.make_graph([onnx.helper.make_node("Add", ["x", "w"], ["y"])], "g", [x], [y], [weights])
     model = onnx.helper.make_model(graph, ir_version=10, opset_imports=[onnx.helper.make_opsetid("", 17)])
     ones = np.ones(4, np.float32)

@@ -218,8 +218,7 @@ def test_a_floor_at_a_grazing_angle_gives_no_return(angle: float) -> None:
     """A floor 1 m below a horizontal camera: each row of pixels sees the floor at the row's angle below the horizon."""
     focal = 200.0
     rows = np.arange(1, 150)
-    depth = np.broadcast_to((focal / rows)[:, None], (len(rows), 40))
-    view = rd.DepthView(depth, (focal, focal, 20.0, -1.0), np.eye(4))
+    view = rd.DepthView(np.broadcast_to((focal / rows)[:, None], (len(rows), 40)), (focal, focal, 20.0, -1.0), np.eye(4))
     noise = DepthNoise(spread=0.0, stray=0.0, flying=0.0, edge_missing=0.0, grazing=angle)
     seen = np.asarray((noise.applied(view, np.random.default_rng(0)).depth > 0).all(axis=1))
     expected = np.asarray(np.arctan(rows / focal) > angle)

@@ -29,9 +29,8 @@ def test_points_of_pixels_and_intrinsics_as_a_mapping_or_a_matrix() -> None:
     depth[0, 0] = np.nan
     depth[1, 1] = np.inf
     depth[2, 2] = -1.0
-    view = rd.DepthView(depth, K, T)
     by_hand = T @ [(20 - 31.5) / 50 * 2, (10 - 23.5) / 50 * 2, 2.0, 1.0]
-    assert np.allclose(view.points(), by_hand[:3])
+    assert np.allclose(rd.DepthView(depth, K, T).points(), by_hand[:3])
     each: list[Any] = [dict(zip(("fx", "fy", "cx", "cy"), K, strict=True)), MATRIX, np.array(MATRIX)]
     for given in each:
         assert rd.DepthView(depth, given, T).intrinsics == K
@@ -131,8 +130,7 @@ def test_views_survive_their_files(tmp_path: Path) -> None:
     assert read_views(written, tmp_path)[0][0].noise == DepthNoise(spread=0.006)
     assert [w["depth" if "depth" in w else "cloud"] for w in written] == ["a.png", "cloud.npy"]
     inline = [rd.DepthView(views[0].depth, K, T), rd.DepthView.from_cloud(points, T)]
-    again = read_views([view_entry(v, None) for v in inline], tmp_path)[0]
-    for view in (*read_views(written, tmp_path)[0], *again):
+    for view in (*read_views(written, tmp_path)[0], *read_views([view_entry(v, None) for v in inline], tmp_path)[0]):
         twin = views[0] if view.cloud is None else views[1]
         assert np.array_equal(view.depth, twin.depth) and np.allclose(view.points(), twin.points())
         assert np.allclose(view.T_base_camera, T)

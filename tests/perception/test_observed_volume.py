@@ -80,8 +80,7 @@ def test_free_voxels_hold_no_point_of_any_pixel(seed: int) -> None:
         depth[(u - a) ** 2 + (v - b) ** 2 < r * r] = rng.uniform(0.6, 2.4)
     seen = observe([view(depth)], PANDA, AWAY)
     index = np.floor((view(depth).points() - LOW) / VOXEL).astype(int)
-    inside = ((index >= 0) & (index < SHAPE)).all(axis=1)
-    assert not seen.free[tuple(index[inside].T)].any()
+    assert not seen.free[tuple(index[((index >= 0) & (index < SHAPE)).all(axis=1)].T)].any()
     corners = np.stack(np.meshgrid(*[[-0.499, 0.499]] * 3, indexing="ij"), -1).reshape(-1, 3) * VOXEL
     away = (centers()[seen.free][:, None] + corners).reshape(-1, 3) - (1.6, 0.0, 0.5)
     at = np.rint(np.stack([away[:, 1], -away[:, 2]], 1) / -away[:, :1] * FOCAL + [159.5, 119.5]).astype(int)
@@ -103,9 +102,8 @@ def test_several_views_add_up() -> None:
 
 
 def test_the_arm_is_no_obstacle_and_casts_a_shadow() -> None:
-    spheres = PANDA.placed_spheres(HOME)
     T = camera()
-    depth = np.minimum(depth_of_balls(spheres, T, INTRINSICS, (WIDTH, HEIGHT)), 2.2)
+    depth = np.minimum(depth_of_balls(PANDA.placed_spheres(HOME), T, INTRINSICS, (WIDTH, HEIGHT)), 2.2)
     assert (depth < 2.19).any()
     seen = observe([view(depth.astype(np.float32), q=HOME)], PANDA, AWAY)
     assert {*np.nonzero(seen.occupied)[0]} == {int((1.6 - 2.2 - LOW[0]) / VOXEL)}, "the wall behind alone"

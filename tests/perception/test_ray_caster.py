@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import robotdiffuse as rd
 from helpers.panda import PANDA
@@ -74,11 +73,10 @@ def test_pybullets_camera_sees_the_same(tmp_path: Path) -> None:
     eye, target = (1.4, 0.6, 0.9), (0.3, 0.1, 0.3)
     client = pybullet.connect(pybullet.DIRECT)
     try:
-        half = (box.size / 2).tolist()
         file = str(tmp_path / "ball.obj")  # finer than Bullet's own
         trimesh.creation.icosphere(4, ball.radius).export(file)
         seen = (
-            (box, pybullet.createVisualShape(pybullet.GEOM_BOX, halfExtents=half)),
+            (box, pybullet.createVisualShape(pybullet.GEOM_BOX, halfExtents=(box.size / 2).tolist())),
             (ball, pybullet.createVisualShape(pybullet.GEOM_MESH, fileName=file)),
         )
         for shape, visual in seen:

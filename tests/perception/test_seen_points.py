@@ -55,9 +55,8 @@ def test_the_arm_is_filtered_as_it_stood_then() -> None:
 
 def test_clouds_and_several_views_add_up() -> None:
     seen = view(BALL_ROW)
-    cloud = rd.DepthView.from_cloud(seen.points(), T)
     one = shown.seen_points([seen], PANDA, START)
-    both = shown.seen_points([seen, cloud], PANDA, START)
+    both = shown.seen_points([seen, rd.DepthView.from_cloud(seen.points(), T)], PANDA, START)
     assert len(one) == len(both) and np.linalg.norm(one[:, None] - both, axis=2).min(axis=1).max() < 1e-5
     many = rd.DepthView.from_cloud(np.random.default_rng(0).uniform(-1, 1, (400_000, 3)), T)
     assert len(shown.seen_points([many], PANDA, START)) > shown.INITIAL_CELLS
@@ -134,9 +133,8 @@ def test_each_point_is_larger_by_what_its_own_view_may_be_off() -> None:
     errors = point_errors([replace(view(BALL_ROW), pose_deviation=(0.005, 0.02))], points)
     by_hand = 0.005 + 0.02 * np.linalg.norm(points - T[:3, 3], axis=1)
     np.testing.assert_allclose(errors, np.column_stack([by_hand, np.zeros(len(points))]))
-    shapes = shown.point_shapes(points, PANDA, rd.Scene([]), START, START[None], errors)
     single = points.astype(np.float32)
-    for shape in shapes:
+    for shape in shown.point_shapes(points, PANDA, rd.Scene([]), START, START[None], errors):
         own = errors[np.isin(single, shape.points.astype(np.float32)).all(axis=1), 0]
         grown = shape.point_radius - shown.POINT_RADIUS
         assert len(own) == len(shape.points)

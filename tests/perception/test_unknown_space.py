@@ -47,11 +47,10 @@ def test_only_wide_regions_without_a_return_lower_the_confidence() -> None:
 def test_only_what_the_arm_fills_at_the_ends_is_left_out_without_a_margin() -> None:
     """Regression: the stated confidence was 0.98 for a hand that grazes an unseen cupboard beside its goal."""
     path = rd.Path(PANDA.joint_names, np.stack([START, START + 0.015, START]))
-    filled = FINE.filled(PANDA, [START])
     arguments = PANDA, START[None], np.ones(FINE_SHAPE, np.bool_), np.full(FINE_SHAPE, 0.01, np.float32)
     bare = UnknownSpace(*arguments, margin=0.0).crossed(path)
     usual = UnknownSpace(*arguments).crossed(path)
-    assert bare.voxels.any() and not (bare.voxels & filled).any()
+    assert bare.voxels.any() and not (bare.voxels & FINE.filled(PANDA, [START])).any()
     assert not usual.voxels.any() and usual.risk == 0
     assert bare.risk is not None and np.isclose(bare.risk, 0.01 * bare.voxels.sum(), rtol=1e-4)
 

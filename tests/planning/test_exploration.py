@@ -126,8 +126,7 @@ def test_nothing_further_than_the_margin_from_a_goal_is_exempt() -> None:
         beyond = np.flatnonzero(unseen & (distances.min(axis=1) > CARVING_MARGIN + 1e-6))
         if len(beyond):
             outside += 1
-            way = points[: beyond[0] + 1]
-            assert any((tree.query(way)[0] <= size + 1e-6).any() for tree, size in trees)
+            assert any((tree.query(points[: beyond[0] + 1])[0] <= size + 1e-6).any() for tree, size in trees)
     assert outside > 100
 
 
@@ -189,8 +188,7 @@ def test_a_look_is_found_where_a_narrow_gap_alone_leads_out() -> None:
     """Regression: searches to viewpoints that were chosen first failed in four scenes where a tree of motions gets out."""
     known = OccupancyMap(PANDA)
     known.declare_free(((-1.1, 0.3, 0.0), (1.1, 1.1, 1.1)))
-    scene = rd.Scene(not_seen_free(known, rd.Scene(), HOME))
-    tree = ReachableTree(PANDA, scene, HOME)
+    tree = ReachableTree(PANDA, rd.Scene(not_seen_free(known, rd.Scene(), HOME)), HOME)
     rng = np.random.default_rng(0)
     tree.grow(HOME + 0.3 * rng.standard_normal((3000, 7)), rng.random(3000) ** 2)
     assert len(tree) > 10
@@ -218,8 +216,7 @@ def test_where_no_look_can_be_reached_the_arm_leaves_a_goal_by_the_way_in() -> N
     zone = ((-0.36, -0.36, 0.0), (0.9, 0.9, 1.1))  # all that is known; OUTSIDE reaches out of it
     one = rd.Explorer(PANDA, [camera], rd.Scene([FLOOR]), zone, rd.ExplorerSettings(time_limit=1.0))
     one.observe(replace(view(), depth=np.zeros_like(view().depth)))
-    inner = PROBLEM.start + np.array([0.8, 0.0, 0.0, -0.1, 0.0, 0.0, 0.0])
-    one.set_goal(inner)
+    one.set_goal(PROBLEM.start + np.array([0.8, 0.0, 0.0, -0.1, 0.0, 0.0, 0.0]))
     step = one.next(PROBLEM.start)
     assert step.kind == "go"
     way_in = step.motion.path.positions
@@ -242,8 +239,7 @@ def test_without_the_network_a_motion_through_space_seen_free_is_certain_enough(
 
 def seen_from(position: tuple[float, float, float], *shapes: rd.Box) -> rd.DepthView:
     T = looking_at(np.array(position), np.array([0.45, 0.25, 0.55]))
-    intrinsics = (230.0, 230.0, 159.5, 119.5)
-    return ray_cast(rd.Scene([FLOOR, *shapes]), T, intrinsics, (320, 240), PANDA, LEFT)
+    return ray_cast(rd.Scene([FLOOR, *shapes]), T, (230.0, 230.0, 159.5, 119.5), (320, 240), PANDA, LEFT)
 
 
 ABOVE_AND_BESIDE = ((1.3, -0.5, 0.6), (-0.3, 1.1, 0.9), (0.4, 1.3, 0.2))
@@ -257,8 +253,7 @@ def test_a_goal_behind_a_plate_is_refused_until_views_show_it() -> None:
     goal = LEFT.copy()
     goal[0] += 0.12
     for see_goal in (False, True):
-        settings = rd.ExplorerSettings(time_limit=1.0, see_goal=see_goal)
-        one = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), ZONE, settings)
+        one = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), ZONE, rd.ExplorerSettings(time_limit=1.0, see_goal=see_goal))
         one.observe(seen_from((1.3, 0.9, 0.6), plate))
         one.set_goal(goal)
         step = one.next(LEFT)
@@ -292,9 +287,8 @@ def test_a_thing_at_the_surface_of_a_goal_is_seen_as_free_by_no_view() -> None:
 def test_fields_that_exploring_would_ignore_are_refused() -> None:
     ball = rd.MovingObstacle(rd.Sphere([0.9, 0.0, 0.9], 0.05, name="ball"), velocity=[0.1, 0, 0])
     for name, field in (("waypoints", [PROBLEM.start]), ("moving", [ball])):
-        asked = replace(PROBLEM, **{name: field})
         message = f"the problem has {name}, which explore does not support"
-        refuses(message, simulated.simulated_explorer, asked, rd.ExplorerSettings(), None, 0)
+        refuses(message, simulated.simulated_explorer, replace(PROBLEM, **{name: field}), rd.ExplorerSettings(), None, 0)
 
 
 def test_an_explorer_and_a_camera_of_wrong_parts_are_refused() -> None:
@@ -374,8 +368,7 @@ def test_certified_stops_before_a_ball_that_appears_are_free_in_the_true_scene(m
         certified.append(stop.certified)
         way = np.concatenate([motion.positions[motion.times < time], stop.motion.positions])
         rests.append(way[-1])
-        valid = rd.verify(replace(true, goal=way[-1]), rd.Path(PANDA.joint_names, way)).valid
-        assert valid or not stop.certified
+        assert rd.verify(replace(true, goal=way[-1]), rd.Path(PANDA.joint_names, way)).valid or not stop.certified
         assert np.abs(motion.positions - way[-1]).max(axis=1).min() < 0.02, "it stays on the path"
     assert certified[0] and not certified[-1], "the later, the harder"
     assert explorer.next(rests[0]).kind in ("go", "look", "stuck")

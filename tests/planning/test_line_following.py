@@ -48,8 +48,7 @@ def test_motion_is_on_the_line_at_every_millisecond(name: str) -> None:
     assert rd.verify(result.problem, t).valid
     if name == "tilt in place":
         assert rd.certify(result.problem, t) is not None
-    clock = np.arange(0.0, t.duration, 1e-3)
-    T = PANDA.fk(CubicHermiteSpline(t.times, t.positions, t.velocities)(clock), HAND)
+    T = PANDA.fk(CubicHermiteSpline(t.times, t.positions, t.velocities)(np.arange(0.0, t.duration, 1e-3)), HAND)
     way = T_end[:3, 3] - T_START[:3, 3]
     turn = T_end[:3, :3] @ T_START[:3, :3].T
     angle = rotation_angle(turn)

@@ -44,10 +44,9 @@ def test_what_hides_counts_as_often_as_it_is_there() -> None:
     away = looking_at(middle + np.array([3, 0, 0]), middle + np.array([6, 0, 0]))
     intrinsics = np.array([100, 100, 50, 40], np.float32)
     stacked = np.stack([*poses, away]).astype(np.float32)
-    weights = np.array([2.0], np.float32)
     far = np.float32(np.inf)
     above = np.tile(np.zeros(PANDA.dof, np.float32), (3, 1))
-    scene = voxel, weights, filled, low + np.array([0, 1, 0], np.float32), np.float32(0.1)
+    scene = voxel, np.array([2.0], np.float32), filled, low + np.array([0, 1, 0], np.float32), np.float32(0.1)
     stacked[:, :3, 3] += [0, 1, 0]  # beside the arm
     seen = seen_weights(compile_robot(PANDA), above, stacked, intrinsics, (81, 101), far, *scene)
     np.testing.assert_allclose(seen, [1.0, 2.0, 0.0], rtol=1e-6)
@@ -85,8 +84,7 @@ def test_it_looks_from_where_nothing_is_in_the_way(problem: Problem, result: Pla
     found = next_view(problem, result, [BEYOND, ABOVE])
     assert np.array_equal(found.T_base_camera, ABOVE) and 0.2 < found.seen <= 1
     assert next_view(problem, result, [BEYOND]).seen < 0.1
-    anywhere = next_view(problem, result)
-    assert anywhere.seen >= max(next_view(problem, result, [T]).seen for T in poses_around()[::7])
+    assert next_view(problem, result).seen >= max(next_view(problem, result, [T]).seen for T in poses_around()[::7])
     above = ray_cast(WALL, ABOVE, INTRINSICS, (160, 120), PANDA, START)
     seen_twice = replace(problem, scene=Scene(), views=(*problem.views, above))
     assert next_view(seen_twice, result, [ABOVE]).seen < found.seen

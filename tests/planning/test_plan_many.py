@@ -19,8 +19,7 @@ BURIED = rd.Scene([rd.Sphere([0.0, 0.0, 0.3], 0.5, name="everything")])
 
 
 def problems() -> list[rd.Problem]:
-    heights = (0.2, 0.4, 0.6)
-    scenes = [rd.Scene([rd.Box([0.45, 0.0, h], [0.3, 0.05, 0.4], name="wall")]) for h in heights]
+    scenes = [rd.Scene([rd.Box([0.45, 0.0, h], [0.3, 0.05, 0.4], name="wall")]) for h in (0.2, 0.4, 0.6)]
     return [rd.Problem(PANDA, scene, LEFT, RIGHT) for scene in [*scenes, BURIED]]
 
 
@@ -35,8 +34,7 @@ def test_results_are_in_order_and_as_alone() -> None:
     assert counts == [(done, 5) for done in range(1, 6)]
     assert [result.status for result in results] == [rd.Status.SOLVED] * 4 + [rd.Status.INVALID_START]
     for problem, together in zip(asked[:4], results[:4], strict=True):
-        alone = rd.plan(problem, planner="aorrtc", **request)
-        assert np.array_equal(together.path.positions, alone.path.positions)
+        assert np.array_equal(together.path.positions, rd.plan(problem, planner="aorrtc", **request).path.positions)
         assert rd.verify(problem, together.path).valid
 
 
@@ -45,8 +43,7 @@ def test_a_process_that_dies_costs_one_problem(monkeypatch: pytest.MonkeyPatch) 
     deadly = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.4], name="deadly")])
     asked.insert(1, rd.Problem(PANDA, deadly, LEFT, RIGHT))
     asked.insert(3, replace(asked[0], robot=replace(PANDA, name="unknown")))
-    entry = Entry("helpers.planners:Deadly", "dies of it", "RRTConnectSettings", SEARCH)
-    monkeypatch.setitem(PLANNERS, "deadly", entry)
+    monkeypatch.setitem(PLANNERS, "deadly", Entry("helpers.planners:Deadly", "dies of it", "RRTConnectSettings", SEARCH))
     results = list(rd.plan_many(asked, "deadly", workers=1, time_limit=300.0))
     ends = [result.status for result in results]
     assert ends == [rd.Status.SOLVED, rd.Status.ERROR, rd.Status.SOLVED, rd.Status.ERROR, rd.Status.SOLVED]
@@ -75,8 +72,7 @@ def test_a_script_that_processes_cannot_import_is_an_error(others: str, tmp_path
     """Regression: the call hung, since the robots for a starting process do not fit into a pipe that nobody reads."""
     script = tmp_path / "script.py"
     script.write_text(f'if __name__ != "__main__":\n    {others or "pass"}\n{PLANS}')
-    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=500)
-    lines = ended.stdout.splitlines()
+    lines = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=500).stdout.splitlines()
     assert len(lines) == 2 and len({*lines}) == 1
     assert lines[0].startswith("error a worker process could not import the main script")
     assert lines[0].endswith('below the line: if __name__ == "__main__":')

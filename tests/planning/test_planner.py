@@ -78,8 +78,7 @@ def test_plan_with_a_planner_and_settings_by_name() -> None:
 
 def test_the_default_planner_is_aorrtc_and_needs_no_weights() -> None:
     panda = replace(PANDA, name="stranger")
-    ball = rd.Scene([rd.Sphere([0.5, 0.0, 0.4], 0.15, name="ball")])
-    problem = rd.Problem(panda, ball, LEFT, RIGHT)
+    problem = rd.Problem(panda, rd.Scene([rd.Sphere([0.5, 0.0, 0.4], 0.15, name="ball")]), LEFT, RIGHT)
     names = (DEFAULT_PLANNER, "aorrtc")
     first, second = (rd.load_planner(name).plan(problem, 60.0, seed=3) for name in names)
     assert np.array_equal(first.path.positions, second.path.positions)

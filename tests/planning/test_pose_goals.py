@@ -58,14 +58,12 @@ def test_both_hands_are_brought_to_their_poses() -> None:
     problem, goal = both_hands()
     found = pose_configurations(problem, goal, np.random.default_rng(0))
     assert len(found) == 10 and max(off(baxter(), goal, q) for q in found) < 1e-5
-    between = np.abs(found[:, None] - found).max(axis=2)
-    assert between[~np.eye(10, dtype=bool)].min() > 0.1
+    assert np.abs(found[:, None] - found).max(axis=2)[~np.eye(10, dtype=bool)].min() > 0.1
     result = rd.plan(problem, time_limit=20.0)
     assert result.solved, result.reason
     assert off(baxter(), goal, result.path.positions[-1]) < 1e-5
     assert check(rd.certify(problem, result.path), problem).valid
-    here = replace(problem, goal=poses_at(baxter(), problem.start, HANDS))
-    assert rd.plan(here, time_limit=10.0).path_length < 1e-4
+    assert rd.plan(replace(problem, goal=poses_at(baxter(), problem.start, HANDS)), time_limit=10.0).path_length < 1e-4
 
 
 def test_links_that_share_a_joint_are_brought_there_together(tmp_path: Path) -> None:
@@ -74,8 +72,7 @@ def test_links_that_share_a_joint_are_brought_there_together(tmp_path: Path) -> 
     parts = chain("base", ["waist"]), *arms
     robot = read_urdf(written(tmp_path, *parts), group="both")
     goal = poses_at(robot, np.random.default_rng(1).uniform(0.5 * robot.lower, 0.5 * robot.upper), robot.tips)
-    problem = rd.Problem(robot, rd.Scene(), np.zeros(robot.dof), goal)
-    found = pose_configurations(problem, goal, np.random.default_rng(0))
+    found = pose_configurations(rd.Problem(robot, rd.Scene(), np.zeros(robot.dof), goal), goal, np.random.default_rng(0))
     assert len(found) and max(off(robot, goal, q) for q in found) < 1e-5
     assert ((found >= robot.lower) & (found <= robot.upper)).all()
 
@@ -92,10 +89,13 @@ def test_the_validator_names_the_hand_that_is_elsewhere() -> None:
 def test_constraints_are_kept_at_the_poses() -> None:
     """The left hand's orientation is free, but its axis must stay within 0.1 rad of upright."""
     start, there = free()[:2]
-    right = baxter().fk(there, "right_gripper")
     down = transform(np.array([0.7, 0.25, 0.4]), np.diag([1.0, -1.0, -1.0]))
-    left = rd.PoseGoal("left_gripper", down, None, [0.4, 0.4, np.pi])
-    goal = rd.PosesGoal([left, rd.PoseGoal("right_gripper", right)])
+    goal = rd.PosesGoal(
+        [
+            rd.PoseGoal("left_gripper", down, None, [0.4, 0.4, np.pi]),
+            rd.PoseGoal("right_gripper", baxter().fk(there, "right_gripper")),
+        ]
+    )
     upright = rd.AxisCone("left_gripper", [0, 0, 1], [0, 0, -1], 0.1)
     problem = rd.Problem(baxter(), rd.Scene(), start, goal, constraints=[upright])
     found = pose_configurations(problem, goal, np.random.default_rng(0))
@@ -120,8 +120,7 @@ def test_files_keep_them(tmp_path: Path) -> None:
     goal = {"poses": {"left_gripper": pose | {"rpy_tolerance": [0.0, 0.0, 3.1]}, "right_gripper": pose}}
     base = {"xyz": [0.1, 0.2, 0.3], "wxyz": [0.6, 0.0, 0.0, 0.8]}
     for asked in (goal, {"any": [goal]}):
-        record = problem_record(both_hands()[0]) | {"goal": asked, "base": base}
-        problem = rd.load_problem(write_record(tmp_path, record))
+        problem = rd.load_problem(write_record(tmp_path, problem_record(both_hands()[0]) | {"goal": asked, "base": base}))
         kept = problem_record(problem)
         assert problem_record(problem_from_record(kept)) == kept
         each = problem.goal.goals[0] if isinstance(problem.goal, rd.AnyGoal) else problem.goal
@@ -131,8 +130,7 @@ def test_files_keep_them(tmp_path: Path) -> None:
 
 
 def asked(*links: str) -> rd.Problem:
-    goal = rd.PosesGoal([rd.PoseGoal(link, np.eye(4)) for link in links])
-    return rd.Problem(baxter(), rd.Scene(), free()[0], goal)
+    return rd.Problem(baxter(), rd.Scene(), free()[0], rd.PosesGoal([rd.PoseGoal(link, np.eye(4)) for link in links]))
 
 
 def test_what_makes_no_sense_is_one_line() -> None:
@@ -183,8 +181,7 @@ def test_a_pose_where_the_hand_is_costs_no_motion(arm: str) -> None:
         start = start + 2 * np.pi * np.where(robot.continuous, k, 0)
         here = rd.PoseGoal(robot.tip, robot.fk(start))
         for goal in (here, rd.PoseGoal(robot.tip, here.T_base_frame, [0.01] * 3, [0.1, 0.1, np.pi])):
-            result = rd.plan(rd.Problem(robot, FREE, start, goal), 5.0)
-            assert result.path.length < 0.0001
+            assert rd.plan(rd.Problem(robot, FREE, start, goal), 5.0).path.length < 0.0001
 
 
 @pytest.mark.parametrize("arm", ARMS)
@@ -199,13 +196,12 @@ def test_a_pose_nearby_is_reached_by_the_nearest_configuration(arm: str) -> None
         if there is None:
             continue
         T = robot.fk(start)
-        here = rd.PoseGoal(robot.tip, T)
         goal = rd.PoseGoal(robot.tip, transform(T[:3, 3] + shift, T[:3, :3]))
         far = rd.PoseGoal(robot.tip, robot.fk(apart(robot, 1, seed=9)[0]))
         longest = 1.1 * float(np.linalg.norm(there - start))
         for problem in (
             rd.Problem(robot, FREE, start, goal),
-            rd.Problem(robot, FREE, start, goal, waypoints=[here]),
+            rd.Problem(robot, FREE, start, goal, waypoints=[rd.PoseGoal(robot.tip, T)]),
             rd.Problem(robot, FREE, start, rd.AnyGoal((far, goal))),
             rd.Problem(robot, FREE, start, goal, constraints=[rd.CartesianLine(robot.tip)]),
         ):
@@ -282,10 +278,8 @@ def test_of_several_goals_each_is_tried_once(monkeypatch: pytest.MonkeyPatch) ->
     assert isinstance(problem.goal, rd.AnyGoal) and len(problem.goal.goals) == 20 and len(q_free) == 10
     result = rd.plan(problem, 20.0, until="first")
     assert result.goal_index is not None and result.goal_index >= 10 and len(goals) == 20
-    reached = problem.goal.goals[result.goal_index]
-    assert goal_error(problem.robot, reached, result.path.positions[-1]) is None
-    again = rd.plan(problem, 20.0, until="first")
-    assert np.array_equal(again.path.positions, result.path.positions)
+    assert goal_error(problem.robot, problem.goal.goals[result.goal_index], result.path.positions[-1]) is None
+    assert np.array_equal(rd.plan(problem, 20.0, until="first").path.positions, result.path.positions)
 
 
 def test_of_several_goals_no_more_are_tried_late(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -313,5 +307,4 @@ def test_the_goal_index_names_the_goal_that_is_reached() -> None:
     assert result.goal_index is not None
     reached = goals.goals[result.goal_index]
     assert isinstance(reached, rd.PoseGoal)
-    error = PANDA.fk(result.path.positions[-1]) - reached.T_base_frame
-    assert np.abs(error).max() < 1e-4
+    assert np.abs(PANDA.fk(result.path.positions[-1]) - reached.T_base_frame).max() < 1e-4

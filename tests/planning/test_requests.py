@@ -67,14 +67,12 @@ def problem_of(asked: str) -> rd.Problem:
     fields = dict(ASKED[asked][0])
     robot, scene, goal = PANDA, SCENE, fields.pop("goal", GOAL)
     if fields.pop("held", False):
-        stick = rd.Cylinder([0, 0, 0.09], 0.01, 0.06)
-        robot = PANDA.with_tool(HAND, transform(np.array([0.0, 0.0, 0.12])), [stick])
+        robot = PANDA.with_tool(HAND, transform(np.array([0.0, 0.0, 0.12])), [rd.Cylinder([0, 0, 0.09], 0.01, 0.06)])
         robot = robot.attach(rd.Box([0, 0, 0.04], [0.06] * 3, name="parcel"), "tool")
     if fields.pop("seen", False):
         T = looking_at(np.array([1.7, 0.0, 0.3]), np.array([0.0, 0.0, 0.3]))
-        view = ray_cast(SCENE, T, (75.0, 75.0, 39.5, 29.5), (80, 60), PANDA, HOME)
         scene = rd.Scene()
-        fields |= {"views": [view], "unknown": "padded"}
+        fields |= {"views": [ray_cast(SCENE, T, (75.0, 75.0, 39.5, 29.5), (80, 60), PANDA, HOME)], "unknown": "padded"}
     if fields.pop("base", False):
         return rd.Problem.in_world(T_WORLD_BASE, robot, scene.moved(T_WORLD_BASE), HOME, goal, **fields)
     return rd.Problem(robot, scene, HOME, goal, **fields)

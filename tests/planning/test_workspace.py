@@ -20,8 +20,7 @@ def test_motions_are_for_the_obstacles_as_they_are_then() -> None:
     space = panda()
     free = space.plan(GOAL, START, time_limit=10.0)
     assert free.stage == "straight_line"
-    table = rd.Box([0.5, 0.0, -0.2], [1.0, 1.0, 0.1], name="table")
-    space.add(rd.Sphere([0.5, 0.0, 0.6], 0.2, name="ball"), table)
+    space.add(rd.Sphere([0.5, 0.0, 0.6], 0.2, name="ball"), rd.Box([0.5, 0.0, -0.2], [1.0, 1.0, 0.1], name="table"))
     assert space.obstacles == ("ball", "table")
     around = space.plan(GOAL, START, time_limit=10.0)
     assert around.solved and around.path_length > free.path_length + 0.1
@@ -185,10 +184,9 @@ def pick(before: object) -> list[object]:
 
 def test_pick_and_place_is_verified_step_by_step() -> None:
     space = table_with_can()
-    at_place = rd.pose([0.5, 0.3, 0.161])
     steps = [
         *pick(ABOVE),
-        rd.MoveTo(at_place, link="can", name="carry"),
+        rd.MoveTo(rd.pose([0.5, 0.3, 0.161]), link="can", name="carry"),
         rd.MoveRelative([0.0, 0.0, -0.1], "world", name="lower"),
         rd.Detach("can"),
         rd.MoveRelative([0.0, 0.0, -0.1], contacts={"can": FINGERS}, name="retreat"),

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import robotdiffuse as rd
 from helpers.constraint_values import true_values
@@ -47,9 +46,8 @@ def test_values_are_those_of_the_book(constraint: Constraint) -> None:
 @pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)
 def test_what_is_proved_holds_at_every_sample_and_what_is_not_proved_does_not(constraint: Constraint) -> None:
     """The proof succeeds for a limit slightly above the largest of many sampled values, and fails slightly below."""
-    made = problem(constraint)
     rng = np.random.default_rng(1)
-    ready = PathConstraints(made)
+    ready = PathConstraints(problem(constraint))
     for _ in range(20):
         a, b = rng.uniform(PANDA.lower, PANDA.upper, (2, 7))
         q = np.stack([a, a + rng.uniform(0.05, 1) * (b - a)])
@@ -106,8 +104,7 @@ def test_speeds_are_finite_differences() -> None:
     q = rng.uniform(PANDA.lower, PANDA.upper, (10, 7))
     rates = rng.normal(size=(10, 7))
     at = [np.array([PANDA.fk(row, HAND)[:3, 3] for row in q + h * rates]) for h in (-1e-6, 1e-6)]
-    right = np.linalg.norm(at[1] - at[0], axis=1) / 2e-6
-    np.testing.assert_allclose(ready.speeds(q, rates)[:, 0], right, atol=1e-7)
+    np.testing.assert_allclose(ready.speeds(q, rates)[:, 0], np.linalg.norm(at[1] - at[0], axis=1) / 2e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)

@@ -11,9 +11,7 @@ from helpers.refusals import refuses
 from robotdiffuse import Box, Scene, Sphere, load_robot
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.generation.factory import TARGETS
-from robotdiffuse.problems.families import FAMILIES, load_family
-from robotdiffuse.problems.families import family as drawing
-from robotdiffuse.problems.families.family import CONFIGURATION, POSE, POSITION
+from robotdiffuse.problems.families import FAMILIES, family as drawing, load_family
 from robotdiffuse.problems.families.rop import ROP, Rop
 from robotdiffuse.problems.families.scaled import ScaledFamily, family_for, scale_for
 from robotdiffuse.robots.robot import LinkPairTable, scaled
@@ -22,7 +20,7 @@ from robotdiffuse.scenes.surface_points import VisibleRegion, sample_surface
 
 PANDA = load_robot("panda")
 every_family = pytest.mark.parametrize("name", FAMILIES)
-every_target = pytest.mark.parametrize("target", [CONFIGURATION, *TARGETS])
+every_target = pytest.mark.parametrize("target", [drawing.CONFIGURATION, *TARGETS])
 
 
 @every_target
@@ -48,7 +46,7 @@ def test_position_of_the_tip_is_uniform_in_the_region() -> None:
     """Targets are uniform, as the authors': their mean is within five standard deviations of the middle."""
     rng = np.random.default_rng(2)
     empty = replace(ROP, obstacles=(0, 0), tip_x=(0.3, 0.5), tip_y=(-0.2, 0.2), tip_z=(0.3, 0.6))
-    targets = [empty.draw(PANDA, rng, target=POSITION).T_base_tip[:3, 3] for _ in range(100)]
+    targets = [empty.draw(PANDA, rng, target=drawing.POSITION).T_base_tip[:3, 3] for _ in range(100)]
     spread = np.diff(empty.region, axis=0)[0] / np.sqrt(12 * 100)
     assert (np.abs(np.mean(targets, axis=0) - empty.region.mean(axis=0)) < 5 * spread).all()
 
@@ -84,7 +82,7 @@ def test_problems_of_an_arm_of_five_joints_and_a_third_of_the_reach(name: str) -
     """Regression: only ROP had problems for this arm: furniture was out of reach, and the arm reaches few poses."""
     family = family_for(name, SMALL)
     assert isinstance(family, ScaledFamily) and family.scale == 0.4
-    drawn = family.draw(SMALL, np.random.default_rng(3), 2, POSE)
+    drawn = family.draw(SMALL, np.random.default_rng(3), 2, drawing.POSE)
     q = np.concatenate([drawn.start[None], drawn.goals]).astype(np.float64)
     assert CollisionChecker(SMALL, drawn.scene).free(q).all()
     tips = np.array([SMALL.fk(row)[:3, 3] for row in q])
@@ -98,7 +96,7 @@ def test_values_of_prismatic_joints_are_scaled_too(tmp_path: Path) -> None:
     robot = read_urdf(written(tmp_path, lift, chain("lift_link", row("j", 6), xyz="0 0 0.35")))
     family = family_for("rop", robot)
     assert isinstance(family, ScaledFamily)
-    drawn = family.draw(robot, np.random.default_rng(3), 2, POSE)
+    drawn = family.draw(robot, np.random.default_rng(3), 2, drawing.POSE)
     for q in drawn.goals:
         np.testing.assert_allclose(robot.fk(q), drawn.T_base_tip, atol=1e-3)
     assert robot.prismatic[0] and abs(drawn.goals[0][0]) > 0.01

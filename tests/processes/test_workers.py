@@ -89,8 +89,7 @@ if __name__ == "__main__":
 def test_an_ended_worker_leaves_no_locks(tmp_path: Path) -> None:
     """Regression: at the end of `reproduce table2`, Python warned of a leaked semaphore, the lock of tqdm."""
     (tmp_path / "script.py").write_text(LOCKED)
-    ended = subprocess.run([sys.executable, tmp_path / "script.py"], capture_output=True, text=True, check=True)
-    assert not ended.stderr
+    assert not subprocess.run([sys.executable, tmp_path / "script.py"], capture_output=True, text=True, check=True).stderr
 
 
 def wait_until_cancelled() -> None:

@@ -116,8 +116,7 @@ def test_allowed_contacts_are_named_and_all_else_is_checked() -> None:
 
 
 def test_held_objects_stay_with_other_locked_joints() -> None:
-    held = PANDA.attach(SHAPES[2], "panda_hand")
-    closed = held.with_locked({"panda_finger_joint1": 0.0})
+    closed = PANDA.attach(SHAPES[2], "panda_hand").with_locked({"panda_finger_joint1": 0.0})
     assert closed is PANDA.with_locked({"panda_finger_joint1": 0.0}).attach(SHAPES[2], "panda_hand")
     assert closed.detach("cup") is PANDA.with_locked({"panda_finger_joint1": 0.0})
 
@@ -126,9 +125,8 @@ def test_a_tool_is_the_tip_and_its_shapes_are_in_the_frame_of_its_link() -> None
     T_hand_tool = transform(np.array([0.0, 0.0, 0.15]), rotation_about(np.array([1.0, 0, 0]), 0.3))
     robot = PANDA.with_tool("panda_hand", T_hand_tool, [rd.Cylinder([0, 0, 0.1], 0.01, 0.1)])
     q = np.array([0.1, 0.2, 0.3, -1.5, 0.2, 1.5, 0.3])
-    T_base_tool = PANDA.fk(q, "panda_hand") @ T_hand_tool
     assert robot.tip == "tool"
-    assert np.allclose(robot.fk(q, "tool"), T_base_tool)
+    assert np.allclose(robot.fk(q, "tool"), PANDA.fk(q, "panda_hand") @ T_hand_tool)
     on_axis = np.array([0.0, 0.0, 0.05, 1.0]), np.array([0.0, 0.0, 0.15, 1.0])
     for point in on_axis:
         local = np.linalg.inv(T_hand_tool) @ point

@@ -11,7 +11,6 @@ import robotdiffuse as rd
 from helpers.refusals import refuses
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import DATA, ROBOTS, load_robot
 from robotdiffuse.robots.fitting.sphere_fitting import is_inside, stacked_planes
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import gaps
@@ -84,7 +83,7 @@ def test_a_pose_does_not_say_how_often_a_joint_turns() -> None:
     T = robot.fk(home, "tool0")
     for q in goals:
         np.testing.assert_allclose(robot.fk(q, "tool0"), T, atol=1e-9)
-    pose = Problem(robot, rd.Scene([]), start, PoseGoal("tool0", T))
+    pose = rd.Problem(robot, rd.Scene([]), start, rd.PoseGoal("tool0", T))
     result = rd.load_planner("aorrtc").plan(pose, time_limit=10.0, until="first")
     assert result.solved, result.reason
     panda = load_robot("panda")

@@ -51,8 +51,7 @@ def test_torques_are_those_of_the_urdf(name: str, tmp_path: Path) -> None:
     assert np.allclose(ours.limits, model.effortLimit)
     for _ in range(50):
         q, v, a = rng.uniform(robot.lower, robot.upper), *rng.normal(size=(2, robot.dof))
-        expected = pinocchio.rnea(model, data, q, v, a)
-        assert np.allclose(ours.torques(q[None], v[None], a[None])[0], expected, atol=1e-6)
+        assert np.allclose(ours.torques(q[None], v[None], a[None])[0], pinocchio.rnea(model, data, q, v, a), atol=1e-6)
 
 
 def test_bundles_keep_inertias_and_effort_limits(tmp_path: Path) -> None:
@@ -81,8 +80,7 @@ def test_the_validator_names_joint_torque_and_limit() -> None:
     free = rd.Problem(PANDA, rd.Scene(), LOW, FAR)
     result = rd.plan(free, time_limit=10.0)
     assert result.trajectory is not None
-    heavy = replace(free, payload=rd.Payload(3.0, [0.0, 0.0, 0.1]))
-    found = verify_trajectory(heavy, result.trajectory).violation
+    found = verify_trajectory(replace(free, payload=rd.Payload(3.0, [0.0, 0.0, 0.1])), result.trajectory).violation
     assert found is not None and found.kind == "torque" and found.subject == "panda_joint2"
     assert found.message.endswith("N m, its effort limit is 87 N m, with the payload")
     # the limit is too low in the middle, where the rod is level

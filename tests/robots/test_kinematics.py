@@ -13,7 +13,6 @@ from helpers.refusals import refuses
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.learning.training.losses import ForwardKinematics
 from robotdiffuse.robots.motion_bounds import motion_radii
-from robotdiffuse.robots.robot import Robot
 
 
 def configurations(robot: rd.Robot, count: int) -> torch.Tensor:
@@ -47,9 +46,8 @@ class PinocchioArm:
         return (self.T_base_world * self.frame(link)).homogeneous
 
     def jacobian(self, link: str) -> np.ndarray:
-        frame = self.model.getFrameId(link, self.pin.FrameType.BODY)
         axes = self.pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        J = self.pin.getFrameJacobian(self.model, self.data, frame, axes)
+        J = self.pin.getFrameJacobian(self.model, self.data, self.model.getFrameId(link, self.pin.FrameType.BODY), axes)
         columns = [self.model.joints[self.model.getJointId(name)].idx_v for name in self.robot.joint_names]
         return np.kron(np.eye(2), self.T_base_world.rotation) @ J[:, columns]
 
@@ -100,7 +98,7 @@ def test_inverse_kinematics_of_a_robot_nearest_first() -> None:
     refuses("unknown link 'moon'", panda.jacobian, q, "moon")
 
 
-def with_spheres(robot: Robot) -> Robot:
+def with_spheres(robot: rd.Robot) -> rd.Robot:
     """The robot with three random spheres on each link but the second, which has none."""
     rng = np.random.default_rng(5)
     links = [link for link in robot.link_names if link != robot.link_names[1]]
@@ -108,7 +106,7 @@ def with_spheres(robot: Robot) -> Robot:
     return replace(robot, spheres=spheres)
 
 
-def sampled_radii(robot: Robot, count: int) -> np.ndarray:
+def sampled_radii(robot: rd.Robot, count: int) -> np.ndarray:
     """Largest distances over random configurations, many of them with joints at a limit."""
     rng = np.random.default_rng(1)
     q = rng.uniform(robot.lower, robot.upper, (count, robot.dof))

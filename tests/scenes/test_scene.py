@@ -87,10 +87,9 @@ def test_costs_pass_over_allowed_contacts() -> None:
 def test_a_large_mesh_that_may_be_touched_is_still_seen_by_other_links() -> None:
     made = trimesh.creation.icosphere(subdivisions=6, radius=0.1)  # 81,920 triangles
     mesh = rd.Mesh(made.vertices, made.faces, BALL.center, name="ball")
-    q = np.zeros((1, 3))
     for links, free in ((["l3"], True), (["l1", "l2"], False)):
         checker = CollisionChecker(box_arm(), rd.Scene([mesh], {"ball": links}))
-        assert len(checker.scene_arrays.solids) <= 1000 and checker.free(q)[0] == free
+        assert len(checker.scene_arrays.solids) <= 1000 and checker.free(np.zeros((1, 3)))[0] == free
 
 
 def test_held_objects_are_links() -> None:
@@ -113,8 +112,7 @@ def test_unknown_names_are_errors_with_the_known_ones() -> None:
 def test_a_name_given_twice_stands_for_both() -> None:
     scene = rd.Scene([BALL, BALL, WALL], {"ball": ["l3"], "ball_2": ["l2"]})
     assert scene.allowed_contacts == (("ball", ("l3",)), ("ball_2", ("l3", "l2")))
-    more = scene.with_shapes([*scene.shapes[1:], BALL])
-    assert [shape.name for shape in more.shapes] == ["ball_2", "wall", "ball"]
+    assert [shape.name for shape in scene.with_shapes([*scene.shapes[1:], BALL]).shapes] == ["ball_2", "wall", "ball"]
     grown = rd.Scene([BALL], {"ball": ["l3"]}).with_shapes([BALL, replace(BALL, center=[1.1, 0.3, 0.0])])
     assert grown.may_touch("l3", "ball") and not grown.may_touch("l3", "ball_2")
     assert not scene.with_shapes([WALL]).allowed_contacts

@@ -7,7 +7,6 @@ import torch
 import robotdiffuse as rd
 from helpers.refusals import refuses
 from helpers.sphere_oracles import distance
-from robotdiffuse import Box, Capsule, Cylinder, Scene
 from robotdiffuse.core.transforms import rotation_from_quaternion
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.training.batches import random_scenes
@@ -15,17 +14,17 @@ from robotdiffuse.problems.families.rop import ROP_DENSE
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 from robotdiffuse.scenes.surface_points import PANDA_REGION
 
-FLOOR = Box([0, 0, -0.05], [2, 2, 0.1], name="floor")
+FLOOR = rd.Box([0, 0, -0.05], [2, 2, 0.1], name="floor")
 
 
-def dense_scenes(n: int, seed: int = 5) -> list[Scene]:
+def dense_scenes(n: int, seed: int = 5) -> list[rd.Scene]:
     """Dense scenes with a floor, with all boxes turned at random."""
     rng = np.random.default_rng(seed)
     scenes = []
     for _ in range(n):
         shapes = ROP_DENSE.scene(rng).shapes[1:]
-        turned = [Box(s.center, s.size, rng.normal(size=4)) if isinstance(s, Box) else s for s in shapes]
-        scenes.append(Scene([FLOOR, *turned]))
+        turned = [rd.Box(s.center, s.size, rng.normal(size=4)) if isinstance(s, rd.Box) else s for s in shapes]
+        scenes.append(rd.Scene([FLOOR, *turned]))
     return scenes
 
 
@@ -37,7 +36,7 @@ def test_scenes_come_back(floor: bool) -> None:
     back = [packed.scene(i) for i in range(4)]
     for scene, again in zip(scenes, back, strict=True):
         assert [type(shape) for shape in scene.shapes] == [type(shape) for shape in again.shapes]
-        assert isinstance(again.shapes[0], Box) and again.shapes[0].bounds[1, 2] == pytest.approx(0, abs=1e-8)
+        assert isinstance(again.shapes[0], rd.Box) and again.shapes[0].bounds[1, 2] == pytest.approx(0, abs=1e-8)
     twice = PackedScenes.pack(back, 13, floor)
     assert (twice.kinds == packed.kinds).all()
     # unpacking makes a quaternion of float32 one of length 1 in float64
@@ -65,9 +64,9 @@ def test_rows_and_parts() -> None:
 def test_what_cannot_be_packed() -> None:
     (scene,) = dense_scenes(1)
     refuses("2 slots", PackedScenes.pack, [scene], 2)
-    refuses("cylinder", PackedScenes.pack, [Scene([Cylinder([0, 0, 0], 1, 1)])], 2)
-    for floor in (Capsule([0, 0, 0], 1, 1), Box([0, 0, 0], [1, 1, 1], [1, 1, 0, 0])):
-        refuses(f"is a {floor.kind}; it must be a box without rotation", PackedScenes.pack, [Scene([floor])], 2, floor=True)
+    refuses("cylinder", PackedScenes.pack, [rd.Scene([rd.Cylinder([0, 0, 0], 1, 1)])], 2)
+    for floor in (rd.Capsule([0, 0, 0], 1, 1), rd.Box([0, 0, 0], [1, 1, 1], [1, 1, 0, 0])):
+        refuses(f"is a {floor.kind}; it must be a box without rotation", PackedScenes.pack, [rd.Scene([floor])], 2, floor=True)
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -89,19 +88,17 @@ def test_points_lie_on_surfaces():
             assert not cloud.any()
         else:
             # float32 of coordinates of up to 1.5 m
-            gaps = [np.abs(distance(shape, cloud)) for shape in shapes]
-            np.testing.assert_allclose(np.min(gaps, axis=0), 0, atol=1e-6)
+            np.testing.assert_allclose(np.min([np.abs(distance(shape, cloud)) for shape in shapes], axis=0), 0, atol=1e-6)
     near = surface_clouds(scenes, 200, seeded(), region=PANDA_REGION).numpy()
     assert PANDA_REGION.holds(near[near.any((1, 2))]).all() and near.any((1, 2)).sum() > 20
 
 
 def test_uniform_by_area():
-    kinds = np.array([[0, BOX, SPHERE]], np.int8)
     params = np.zeros((1, 3, 10), np.float32)
     params[0, 1] = [0.5, -0.3, 0.4, 0.2, 0.5, 0.3, 0.5, 0.5, -0.5, 0.5]
     params[0, 2, :4] = [-0.4, 0.2, 0.6, 0.15]
     n = 40_000
-    cloud = surface_clouds(PackedScenes(kinds, params), n, seeded())[0].double().numpy()
+    cloud = surface_clouds(PackedScenes(np.array([[0, BOX, SPHERE]], np.int8), params), n, seeded())[0].double().numpy()
     row = params[0, 1].astype(np.float64)
     local = (cloud - row[:3]) @ rotation_from_quaternion(row[6:]) / (row[3:6] / 2)
     on_box = np.isclose(np.abs(local).max(1), 1, atol=1e-5)

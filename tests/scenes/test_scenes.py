@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy import ndarray
 from trimesh.triangles import closest_point
@@ -19,8 +18,7 @@ from helpers.point_files import FORMS, PCD, lzf_packed, npy, ply, text, write_po
 from helpers.refusals import refuses
 from helpers.sphere_oracles import distance
 from robotdiffuse.core.mesh_files import read_triangles
-from robotdiffuse.scenes.files import SHAPES as KINDS
-from robotdiffuse.scenes.files import read_scene, scene_entries
+from robotdiffuse.scenes.files import SHAPES as KINDS, read_scene, scene_entries
 from robotdiffuse.scenes.point_cloud import crop, distinct, lzf_unpacked, read_points, voxel_thin
 from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.scenes.surface_points import VisibleRegion, draw, sample_surface

@@ -167,9 +167,8 @@ def test_other_hosts_content_types_and_methods_are_refused(server: httpx.Client)
 def test_a_client_that_closes_after_sending_gets_its_error(server: httpx.Client) -> None:
     """urllib sends all of its request before it reads, and asks to close the connection."""
     for path, size, code in (("plan", 2**24, 413), ("nothing", 2**22, 404)):
-        request = urllib.request.Request(f"{server.base_url}/{path}", bytes(size), JSON)
         with pytest.raises(urllib.error.HTTPError) as refused:
-            urllib.request.urlopen(request)
+            urllib.request.urlopen(urllib.request.Request(f"{server.base_url}/{path}", bytes(size), JSON))
         assert refused.value.code == code and b'{"error": "' in refused.value.read()
 
 

@@ -222,9 +222,8 @@ def test_collisions_agree_with_coal_meshes_included() -> None:
     torus = trimesh.creation.torus(0.2, 0.05, major_sections=16, minor_sections=8)
     mesh = rd.Mesh(torus.vertices.view(np.ndarray), torus.faces, (-0.3, 0.4, 0.7), (0.5, 0.1, 0.2, 0.9))
     scene = rd.Scene([*solids().shapes, mesh])
-    exact = ExactCollision(robot, scene)
     q = np.random.default_rng(1).uniform(robot.lower, robot.upper, (150, robot.dof))
-    hits = exact.collides(q)
+    hits = ExactCollision(robot, scene).collides(q)
     assert 0.2 < hits.mean() < 0.8
     with PyBulletOracle(robot, scene) as oracle:
         for row, hit in zip(q, hits, strict=True):
@@ -288,9 +287,8 @@ def test_point_clouds_agree_with_coal() -> None:
     points = (0.4, 0.2, 0.5) + 0.25 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
     scene = rd.Scene([rd.PointCloud(points, 0.02)])
     exact = ExactCollision(robot, scene)
-    q = rng.uniform(robot.lower, robot.upper, (40, robot.dof))
     with PyBulletOracle(robot, scene) as oracle:
-        for row in q:
+        for row in rng.uniform(robot.lower, robot.upper, (40, robot.dof)):
             right = min(d.distance for d in (*exact.link_distances(row), *exact.pair_distances(row)))
             if right > 0:
                 assert oracle.distance(row) == pytest.approx(right, abs=TOLERANCE)

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import toppra
-from hypothesis import example, given
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
 from scipy.optimize import linprog
 
 import robotdiffuse as rd
@@ -218,9 +217,8 @@ def test_motions_from_a_start_velocity_keep_all_limits(seed: int, jerk: float, s
     direction /= np.linalg.norm(direction)
     velocity = ratio * scale * float((robot.velocity / np.abs(direction)).min()) * direction
     stop = speed_limits.stopping_distance(robot, settings, velocity) * direction
-    start_speed = float(np.linalg.norm(velocity))
     for q in (np.stack([0 * stop, stop]), np.stack([0 * stop, stop, stop + 0.5 * rng.normal(size=7)])):
-        t = timed(q, settings=settings, start_speed=start_speed)
+        t = timed(q, settings=settings, start_speed=float(np.linalg.norm(velocity)))
         assert np.array_equal(t.positions[0], q[0]) and np.array_equal(t.positions[-1], q[-1])
         assert np.allclose(t.velocities[0], velocity, rtol=1e-12) and not t.accelerations[0].any()
         assert not t.velocities[-1].any() and not t.accelerations[-1].any() and len(t.stops) == 0
@@ -232,9 +230,8 @@ def test_motions_from_a_start_velocity_keep_all_limits(seed: int, jerk: float, s
 
 def test_a_limit_of_jerk_costs_what_it_must() -> None:
     """One joint needs (32 d / j)^(1/3). Regression: accelerations of seven fixed fractions of the limits took 20 times that."""
-    robot = arm((20.0,), (80.0,))
     free, slight, *gentle = (
-        timed([[0.0], [1.0]], settings=TimingSettings(jerk=jerk), robot=robot).duration
+        timed([[0.0], [1.0]], settings=TimingSettings(jerk=jerk), robot=arm((20.0,), (80.0,))).duration
         for jerk in (np.inf, 1e5, 50.0, MIN_JERK)
     )
     least = (32 / np.array([50.0, MIN_JERK])) ** (1 / 3)

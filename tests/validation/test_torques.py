@@ -33,9 +33,8 @@ def test_no_torque_leaves_its_chord_by_more_than_its_bound(name: str, step: floa
 @pytest.mark.parametrize(("effort", "valid"), [(9.70, False), (9.73, True)])
 def test_a_peak_between_two_rows_is_found(effort: float, valid: bool) -> None:
     """The torque is 9.81 N m when the rod is horizontal, between two rows; the validator allows an excess of 1 %."""
-    robot = pendulum(effort)
     path = rd.Path(("hinge",), np.array([[0.3], [2.84], [2.9]]))
-    problem = rd.Problem(robot, rd.Scene(), path.positions[0], path.positions[-1], payload=rd.Payload(0.0))
+    problem = rd.Problem(pendulum(effort), rd.Scene(), path.positions[0], path.positions[-1], payload=rd.Payload(0.0))
     violation = rd.verify(problem, path).violation
     assert (violation is None) == valid
     if violation is not None:
@@ -58,9 +57,8 @@ def test_a_peak_between_two_times_is_found() -> None:
 
 def test_torques_are_those_of_the_cubics() -> None:
     """At rest, the cubic has 12 rad/s² at both ends, whatever accelerations are written; gravity alone needs 2.4 N m."""
-    rows = np.array([[-0.25], [0.25]])
     still = np.zeros((2, 1))
-    motion = rd.Trajectory(("hinge",), np.array([0.0, 0.5]), rows, still, still)
+    motion = rd.Trajectory(("hinge",), np.array([0.0, 0.5]), np.array([[-0.25], [0.25]]), still, still)
     assert beyond(5.3, trajectory_pieces(motion)) and not beyond(6.0, trajectory_pieces(motion))
 
 
@@ -93,8 +91,7 @@ def test_what_is_proved_holds_at_every_look() -> None:
     dynamics = Dynamics(panda, payload)
     pieces = trajectory_pieces(motion)
     rng = np.random.default_rng(0)
-    count = len(motion.times) - 1
-    torques = np.abs(dynamics.torques(*pieces.states(rng.integers(count, size=4000), rng.random(4000))))
+    torques = np.abs(dynamics.torques(*pieces.states(rng.integers(len(motion.times) - 1, size=4000), rng.random(4000))))
     for share in (1.1, 1.003, 0.999, 0.95):
         dynamics.limits = share * torques.max(axis=0)
         assert (first_excess(dynamics, pieces, 0.0) is None) == (share > 1)

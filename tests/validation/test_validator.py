@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
@@ -89,16 +88,14 @@ def test_thin_walls_on_the_way_are_found(share: float, reach: float, thickness: 
         return
     found = refused(validator(rows, wall, robot=box_arm(spheres)), "scene_collision")
     assert found.other == "box"
-    exact = ExactCollision(box_arm(), rd.Scene([wall]))
     q, at = dense(rows, 1e-3)
-    first = at[exact.collides(q)].min()
+    first = at[ExactCollision(box_arm(), rd.Scene([wall])).collides(q)].min()
     assert first - 0.02 < found.time < first + 0.002
 
 
 def scattered(rng: np.random.Generator) -> list[Shape]:
     """Up to four shapes at random places in the plane of the arm."""
-    kinds = rng.choice(["sphere", "box", "cylinder"], rng.integers(0, 4))
-    shapes = [random_shape(kind, rng) for kind in kinds]
+    shapes = [random_shape(kind, rng) for kind in rng.choice(["sphere", "box", "cylinder"], rng.integers(0, 4))]
     at = vector(*rng.uniform(-1.2, 1.2, 2), 0) + rng.normal(size=(30, 3)) * 0.1
     flat: list[Shape] = [replace(one, center=one.center * [1.2, 1.2, 0.1]) for one in shapes]  # type: ignore
     return [*flat, rd.PointCloud(at, 0.01)] if rng.random() < 0.5 else flat
@@ -108,10 +105,9 @@ def scattered(rng: np.random.Generator) -> list[Shape]:
 def test_the_certificate_agrees_with_dense_sampling(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     shapes = scattered(rng)
-    robot = box_arm()
     rows = rng.uniform(-2, 2, (1, 3)) + rng.uniform(-0.8, 0.8, (count, 3))
     report = validator(rows, *shapes)
-    exact = ExactCollision(robot, rd.Scene(shapes))
+    exact = ExactCollision(box_arm(), rd.Scene(shapes))
     q, at = dense(rows, 2e-3)
     hits = exact.collides(q)
     if report.valid:
@@ -134,9 +130,8 @@ def test_the_first_of_two_collisions_is_reported() -> None:
     early, late = (rd.Sphere(1.1 * vector(np.cos(a), np.sin(a), 0), 0.05, name) for a, name in ((0.1, "b"), (0.5, "a")))
     rows = np.array([[-0.6, 0, 0], [0.2, 0, 0], [1.0, 0, 0]])
     forward = validator(rows, early, late)
-    backward = validator(rows[::-1].copy(), early, late)
     assert refused(forward, "scene_collision").other == "b"
-    assert refused(backward, "scene_collision").other == "a"
+    assert refused(validator(rows[::-1].copy(), early, late), "scene_collision").other == "a"
     found = refused(forward, "scene_collision")
     assert found.subject == "l3"
     # The contact begins where the arm's edge meets the sphere and is deepest in its middle.
@@ -328,9 +323,8 @@ def test_no_motion_within_the_limits_is_refused(seed: int, most: float) -> None:
     """Full acceleration, coasting and braking in random order; rows where it jumps make the cubics equal the motion."""
     rng = np.random.default_rng(seed)
     robot = box_arm()
-    limit = robot.acceleration[0]
     count = 800 if most < 1e-3 else 40
-    fine = np.repeat(rng.choice([-1.0, 0.0, 1.0], (12, 3)), count, axis=0) * limit
+    fine = np.repeat(rng.choice([-1.0, 0.0, 1.0], (12, 3)), count, axis=0) * robot.acceleration[0]
     step = 0.5 * robot.velocity[0] / np.abs(np.cumsum(fine, axis=0)).max()
     fine = np.concatenate([fine, -fine])  # back to rest
     speed = np.concatenate([np.zeros((1, 3)), np.cumsum(fine, axis=0)]) * step

@@ -45,11 +45,9 @@ def test_each_moment_has_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     columns = min(count, 3 if count > 4 else 2)
     with Image.open(tmp_path / "explore.png") as image:
         width = columns * (240 + exploration.GAP) - exploration.GAP
-        height = -(-count // columns) * (150 + exploration.GAP) - exploration.GAP
-        assert image.size == (width, height)
+        assert image.size == (width, -(-count // columns) * (150 + exploration.GAP) - exploration.GAP)
         first = np.asarray(image)[:100, :240].astype(int)
-    blue = (first[..., 2] > first[..., 0] + 25).sum()
-    assert blue > 50, "the wall was seen"
+    assert (first[..., 2] > first[..., 0] + 25).sum() > 50, "the wall was seen"
     for write, ending in ((exploration.write_exploration_picture, "html"), (exploration.write_exploration, "png")):
         refuses("", write, explorer, problem.scene, tmp_path / f"explore.{ending}")
 

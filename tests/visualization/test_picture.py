@@ -33,9 +33,8 @@ def test_picture_shows_the_tip_where_kinematics_puts_it(arm, motion, tmp_path):
 def test_picture_shows_obstacles_in_their_color(arm, scene, motion):
     ball = Scene([scene.shapes[0]])
     camera = view_of_motion(DrawnArm(arm), drawables(ball), motion.positions, (320, 200), MARGINS)
-    pixels = render(arm, ball, motion, SMALL, camera)
     column, row, _ = camera.project(np.array([[-0.5, 0.4, 0.5]]))[0].astype(int)
-    r, g, b = pixels[row, column].astype(int)
+    r, g, b = render(arm, ball, motion, SMALL, camera)[row, column].astype(int)
     assert r > g + 25 > b + 25
 
 

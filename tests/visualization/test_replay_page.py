@@ -9,7 +9,6 @@ import pytest
 import robotdiffuse as rd
 from helpers.pages import page_data
 from helpers.refusals import refuses
-from robotdiffuse import Mesh, Path, PlanResult, PointCloud, Scene, Status
 from robotdiffuse.drawables import decimated
 from robotdiffuse.visualization import PictureSettings, write_picture, write_replay
 from robotdiffuse.visualization.arm import DrawnArm
@@ -19,9 +18,9 @@ SMALL = PictureSettings(width=320, height=200, ghosts=2)
 
 
 def test_replay_holds_everything_and_loads_nothing(arm, scene, motion, tmp_path):
-    path = Path(arm.joint_names, motion.positions)
-    told = Status.SOLVED, "", "robotdiffuse", arm.name, 0.0123, 0, "refinement", path, motion
-    result = PlanResult(*told, min_clearance=0.042)
+    path = rd.Path(arm.joint_names, motion.positions)
+    told = rd.Status.SOLVED, "", "robotdiffuse", arm.name, 0.0123, 0, "refinement", path, motion
+    result = rd.PlanResult(*told, min_clearance=0.042)
     file = tmp_path / "replay.html"
     write_replay(arm, scene, motion, file, result=result, title="a < b </script> {{data}}")
     text = file.read_text("utf-8")
@@ -43,15 +42,14 @@ def test_replay_holds_everything_and_loads_nothing(arm, scene, motion, tmp_path)
     for surface, part in zip(DrawnArm(arm).surfaces, data["robot"]["frames"], strict=True):
         raw = np.frombuffer(base64.b64decode(part["vertices"]), "<u2").reshape(-1, 3)
         np.testing.assert_allclose(part["low"] + raw * part["step"], surface.vertices, atol=1e-5)
-        faces = np.frombuffer(base64.b64decode(part["faces"]), "<u2").reshape(-1, 3)
-        np.testing.assert_array_equal(faces, surface.faces)
+        np.testing.assert_array_equal(np.frombuffer(base64.b64decode(part["faces"]), "<u2").reshape(-1, 3), surface.faces)
 
 
 @pytest.mark.parametrize("rows", [1, 2])
 def test_path_that_does_not_move(arm, rows, tmp_path):
-    path = Path(arm.joint_names, np.tile([0.1, 0.2, 0.1], (rows, 1)))
-    write_replay(arm, Scene(), path, tmp_path / "still.html")
-    write_picture(arm, Scene([PointCloud(np.zeros((0, 3)))]), path, tmp_path / "still.png", settings=SMALL)
+    path = rd.Path(arm.joint_names, np.tile([0.1, 0.2, 0.1], (rows, 1)))
+    write_replay(arm, rd.Scene(), path, tmp_path / "still.html")
+    write_picture(arm, rd.Scene([rd.PointCloud(np.zeros((0, 3)))]), path, tmp_path / "still.png", settings=SMALL)
     assert page_data(tmp_path / "still.html")["times"] == [0.0] * rows
 
 
@@ -62,8 +60,8 @@ def test_large_input_stays_small(arm, tmp_path):
     vertices = np.stack([x, y, 0.05 * np.sin(20 * x)], axis=-1).reshape(-1, 3)
     i = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1)
     faces = np.concatenate([np.stack([i, i + 1, i + n], 1), np.stack([i + 1, i + n + 1, i + n], 1)])
-    scene = Scene([PointCloud(rng.uniform(-1, 1, (100_000, 3))), Mesh(vertices, faces)])
-    write_replay(arm, scene, Path(arm.joint_names, rng.uniform(0, 0.2, (10_000, 3))), tmp_path / "large.html")
+    scene = rd.Scene([rd.PointCloud(rng.uniform(-1, 1, (100_000, 3))), rd.Mesh(vertices, faces)])
+    write_replay(arm, scene, rd.Path(arm.joint_names, rng.uniform(0, 0.2, (10_000, 3))), tmp_path / "large.html")
     assert (tmp_path / "large.html").stat().st_size < 3_000_000
     fewer, kept = decimated(vertices, faces)
     assert 10_000 < len(kept) <= 60_000
@@ -74,24 +72,24 @@ def test_large_input_stays_small(arm, tmp_path):
 @pytest.mark.parametrize(("write", "ending"), [(write_picture, "png"), (write_replay, "html")])
 def test_bad_output_is_one_line(arm, motion, write, ending, name, tmp_path):
     (tmp_path / f"folder.{ending}").mkdir()
-    refuses(".", write, arm, Scene(), motion, tmp_path / name.format(ending, ending))
+    refuses(".", write, arm, rd.Scene(), motion, tmp_path / name.format(ending, ending))
     assert [entry.name for entry in tmp_path.iterdir()] == [f"folder.{ending}"], "nothing is left behind"
 
 
 def test_names_of_obstacles_stay_text_in_a_replay(arm, motion, tmp_path) -> None:
     name = "</script><script>alert(1)</script>"
-    write_replay(arm, Scene([rd.Sphere([1, 1, 1], 0.1, name=name)]), motion, tmp_path / "replay.html")
+    write_replay(arm, rd.Scene([rd.Sphere([1, 1, 1], 0.1, name=name)]), motion, tmp_path / "replay.html")
     text = (tmp_path / "replay.html").read_text("utf-8")
     assert "<script>alert" not in text and page_data(tmp_path / "replay.html")["scene"][0]["name"] == name
 
 
 def test_moving_obstacles_are_on_the_page_and_in_the_picture(arm, motion, tmp_path):
     ball = rd.MovingObstacle(rd.Sphere([0.5, 0.2, 0.3], 0.1, name="ball"), velocity=[0.0, -0.3, 0.0])
-    write_replay(arm, Scene(), motion, tmp_path / "replay.html", moving=[ball])
+    write_replay(arm, rd.Scene(), motion, tmp_path / "replay.html", moving=[ball])
     [mover] = page_data(tmp_path / "replay.html")["moving"]
     assert mover["shape"]["name"] == "ball"
     np.testing.assert_allclose(mover["track"][0], [0, 0, 0, 1, 0, 0, 0], atol=1e-6)
     np.testing.assert_allclose(mover["track"][-1][1], -0.3 * motion.duration, atol=1e-5)
     for name, moving in (("with", [ball]), ("without", [])):
-        write_picture(arm, Scene(), motion, tmp_path / f"{name}.png", settings=SMALL, moving=moving)
+        write_picture(arm, rd.Scene(), motion, tmp_path / f"{name}.png", settings=SMALL, moving=moving)
     assert (tmp_path / "with.png").read_bytes() != (tmp_path / "without.png").read_bytes()

@@ -14,8 +14,7 @@ from robotdiffuse.visualization.arm import DrawnArm
 
 
 def test_trace_follows_the_outer_end_of_the_tip(arm, motion):
-    points = DrawnArm(arm).tool_points(motion.positions[::100])
-    for q, point in zip(motion.positions[::100], points, strict=True):
+    for q, point in zip(motion.positions[::100], DrawnArm(arm).tool_points(motion.positions[::100]), strict=True):
         np.testing.assert_allclose(point, (arm.fk(q, "tip") @ [0, 0, 0.2, 1])[:3], atol=1e-12)
 
 

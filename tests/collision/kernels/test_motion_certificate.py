@@ -5,8 +5,7 @@ from functools import cache
 from itertools import pairwise
 
 import numpy as np
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from numpy import ndarray
 
 import robotdiffuse as rd
@@ -50,8 +49,7 @@ def scene_of(rng: np.random.Generator, cloud: bool) -> rd.Scene:
     """One shape of each kind at random places, and sometimes points."""
     shapes = [random_shape(kind, rng) for kind in ("sphere", "box", "cylinder", "capsule")]
     if cloud:
-        place = rng.uniform([-0.6, -0.6, -0.2], [0.6, 0.6, 0.9])
-        shapes.append(rd.PointCloud(place + rng.normal(0, 0.1, (40, 3)), 0.01))
+        shapes.append(rd.PointCloud(rng.uniform([-0.6, -0.6, -0.2], [0.6, 0.6, 0.9]) + rng.normal(0, 0.1, (40, 3)), 0.01))
     return rd.Scene(shapes)
 
 
@@ -78,8 +76,7 @@ def test_planes_part_as_far_as_coal_says(name: str, seed: int) -> None:
     exact, arrays, (arm, parts) = (ExactCollision(robot, scene), solid_arrays(robot, scene), hulls_of(robot))
     posture = convex_bounds.make_posture(arm, arrays, robot.dof)
     slides = np.array(robot.prismatic, np.bool_)
-    offsets = robot.frame_offsets.copy()
-    convex_bounds.pose(offsets, robot.kernel_parents, slides, q, np.zeros(robot.dof), posture)
+    convex_bounds.pose(robot.frame_offsets.copy(), robot.kernel_parents, slides, q, np.zeros(robot.dof), posture)
     for found in exact.link_distances(q):
         guess = rng.normal(size=3)
         planes = [
@@ -104,9 +101,8 @@ def test_the_certificate_of_curved_motions(name: str, seed: int, cloud: bool) ->
     exact = ExactCollision(robot, scene)
     at = np.linspace(0, len(q) - 1, 30 * len(q))
     dense = np.stack([np.interp(at, np.arange(len(q)), column) for column in q.T], axis=1)
-    hits = exact.collides(dense)
     if found.contact is None:
-        assert not hits.any()
+        assert not exact.collides(dense).any()
         rows = dense[::40]
         links = min(d.distance for row in rows for d in exact.link_distances(row))
         pairs = min(d.distance for row in rows for d in exact.pair_distances(row))
@@ -116,5 +112,4 @@ def test_the_certificate_of_curved_motions(name: str, seed: int, cloud: bool) ->
     distances = (*exact.link_distances(here), *exact.pair_distances(here))
     assert min(d.distance for d in distances if d.link == found.contact.check.link) <= 1.01e-4
     # located to 1 mm of motion: nothing deeper lies well before it
-    before = dense[at < found.contact.at - 0.3]
-    assert not exact.collides(before).any()
+    assert not exact.collides(dense[at < found.contact.at - 0.3]).any()

@@ -21,10 +21,9 @@ def _look_up(table, index, bit, out):
 
 
 def test_gathered_bits() -> None:
-    table = np.arange(100, dtype=np.float32)
     index = np.random.default_rng(1).integers(0, 100, (1, W)).astype(np.float32)
     out = np.zeros((1, W), np.float32)
-    total = _look_up(table, index, np.int32(4), out)
+    total = _look_up(np.arange(100, dtype=np.float32), index, np.int32(4), out)
     np.testing.assert_array_equal(out, index)
     assert total == np.flatnonzero(index[0].astype(int) & 4).sum()
 

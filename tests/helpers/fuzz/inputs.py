@@ -145,8 +145,7 @@ def outcome(call: Callable[[], object]) -> tuple[str, str]:
 
 def outcome_of(kind: str, seed: int, folder: Path) -> tuple[str, str]:
     """Make an input, whose files are written to the folder, and return its outcome."""
-    rng = np.random.default_rng([seed, *kind.encode()])
-    return outcome(KINDS[kind](rng, folder))
+    return outcome(KINDS[kind](np.random.default_rng([seed, *kind.encode()]), folder))
 
 
 def _problem(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
@@ -343,9 +342,8 @@ def _socket(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
 def _motion(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     problem = problem_from_record(examples.SMALL)
     rows = np.array(examples.ROWS)
-    times = np.array([0.0, 10.0, 20.0])
     still = np.zeros_like(rows)
-    trajectory = rd.Trajectory(problem.robot.joint_names, times, rows, still, still)
+    trajectory = rd.Trajectory(problem.robot.joint_names, np.array([0.0, 10.0, 20.0]), rows, still, still)
     ending = (".json", ".yaml", ".csv", ".mcap", ".rosbag2")[rng.integers(5)]
     file = folder / f"motion{ending}"
     if ending == ".json" and rng.random() < 0.3:
@@ -353,8 +351,7 @@ def _motion(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
         file.write_bytes(text_of(rng, json.loads(file.read_text()), ending))
     elif ending in (".json", ".yaml"):
         forms = (lambda r: r, lambda r: {"joint_trajectory": r}, lambda r: {"trajectory": [{"joint_trajectory": r}]})
-        record = forms[rng.integers(3)](joint_trajectory(trajectory))
-        file.write_bytes(text_of(rng, record, ending))
+        file.write_bytes(text_of(rng, forms[rng.integers(3)](joint_trajectory(trajectory)), ending))
     else:
         write_motion(problem, trajectory, file)
         part = file if ending != ".rosbag2" else sorted(file.iterdir())[rng.integers(2)]

@@ -8,8 +8,7 @@ import torch
 
 from helpers.box_arm import box_arm
 from helpers.small_model import SMALL_ENCODER
-from helpers.stores import WAYPOINTS as STORED
-from helpers.stores import manifest_of, random_arrays
+from helpers.stores import WAYPOINTS as STORED, manifest_of, random_arrays
 from robotdiffuse.datasets.shards import write_manifest, write_shard
 from robotdiffuse.learning.checkpoint import save_network
 from robotdiffuse.learning.encoders.networks import PointAutoencoder

@@ -7,7 +7,6 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
 
 from helpers.commands import Said
 from helpers.panda import PANDA
@@ -31,12 +30,11 @@ class Reversal(BaselineNetwork):
 
     def __init__(self, robot: RobotIdentity, settings: ReversalSettings) -> None:
         super().__init__(robot, settings)
-        self.layer = nn.Linear(2 * self.dof, self.dof)
+        self.layer = torch.nn.Linear(2 * self.dof, self.dof)
 
-    def loss(self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator) -> Tensor:
+    def loss(self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator) -> torch.Tensor:
         q = self.to_unit(torch.from_numpy(data.q[rng.integers(0, len(data), count)]))
-        middle = self.layer(torch.cat([q[:, 0], q[:, -1]], -1))
-        return (middle - q[:, q.shape[1] // 2]).square().mean()
+        return (self.layer(torch.cat([q[:, 0], q[:, -1]], -1)) - q[:, q.shape[1] // 2]).square().mean()
 
 
 @pytest.fixture

@@ -55,8 +55,7 @@ def test_a_training_goes_on_without_plots(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_a_short_training_that_diverged_writes_no_weights(tmp_path: Path) -> None:
-    settings = EncoderTraining(minutes=None, samples=3, batch=1)
-    task = ToyTask(settings, lambda call: float("nan") if call > 1 else 1.0)
+    task = ToyTask(EncoderTraining(minutes=None, samples=3, batch=1), lambda call: float("nan") if call > 1 else 1.0)
     refuses("diverged: the loss or its gradient is not finite at step 3", train, task, str(tmp_path))
 
 

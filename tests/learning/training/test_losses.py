@@ -57,9 +57,8 @@ def test_the_hinge_and_its_gradient() -> None:
 
 
 def test_surface_points_move_with_their_links() -> None:
-    points = losses.SurfacePoints(DOUBLE, 3, np.random.default_rng(4))
     q = configurations(2, 4, 5)
-    placed = points(q).numpy()
+    placed = losses.SurfacePoints(DOUBLE, 3, np.random.default_rng(4))(q).numpy()
     links = [link for link, meshes in PANDA.meshes.items() if meshes and PANDA.link_frame(link) > 0]
     assert placed.shape == (2, 4, 3 * len(links), 3)
     for i, link in enumerate(links):

@@ -25,8 +25,7 @@ from robotdiffuse.learning.encoders import make_encoder
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_model import SamplingSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.training import loop as training_run
-from robotdiffuse.learning.training import tasks as training
+from robotdiffuse.learning.training import loop as training_run, tasks as training
 from robotdiffuse.learning.training.batches import Batch, Batches, fast_bf16, load_data
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.loop import Processes, TrainingRun
@@ -172,9 +171,8 @@ def test_every_choice_trains_and_plans(changes, tmp_path, data, arm, monkeypatch
     losses = [float(row["loss"]) for row in read_log(out)]
     assert np.mean(losses[-3:]) < losses[0]
     model = exported_model("model", out, arm)
-    z = model.encode(np.zeros((0, 3)))
     settings = SamplingSettings(samples=3, sampling_steps=8)
-    q = model.sample(START, GOAL, z, nothing_near, np.random.default_rng(0), settings)
+    q = model.sample(START, GOAL, model.encode(np.zeros((0, 3))), nothing_near, np.random.default_rng(0), settings)
     assert q.shape == (3, WAYPOINTS, 3) and np.isfinite(q).all()
     assert (q[:, 0] == START).all() and (q[:, -1] == GOAL).all()
     assert (q >= arm.lower).all() and (q <= arm.upper).all()
@@ -201,17 +199,15 @@ def test_errors_in_the_workspace_have_the_same_weight_for_every_objective(data, 
 @pytest.mark.usefixtures("no_export")
 def test_planner_learns_which_side(tmp_path, data, arm):
     out = tmp_path / "out"
-    settings = planner_settings(data, samples=16 * 300, losses=LossSettings(point=0.01))
-    report = train_planner(settings, str(out))
+    report = train_planner(planner_settings(data, samples=16 * 300, losses=LossSettings(point=0.01)), str(out))
     rows = read_log(out)
     assert float(rows[-1]["loss"]) < 0.3 * float(rows[0]["loss"])
     assert report["samples"] == 4800
     assert 0.0 <= report["success"] <= 1.0 and float(rows[-1]["success"]) == pytest.approx(report["success"])
     assert list((out / "tensorboard").iterdir()), "the extra `train` is installed: a log for TensorBoard"
     model = load_network("model", out, arm)
-    about = json.loads((out / "model.json").read_text())
     loaded = load_data(str(data), arm, model.encoder, WAYPOINTS, print)
-    assert about["training"]["trajectories"] == len(loaded)
+    assert json.loads((out / "model.json").read_text())["training"]["trajectories"] == len(loaded)
     rng = np.random.default_rng(0)
     for side in (-1.0, 1.0):
         scene = rd.Scene([rd.Box([0, 0, -0.05], [2, 2, 0.1]), rd.Sphere([0.0, 0.5 * side, 1.0], 0.2)])

@@ -56,8 +56,7 @@ def test_weights_are_used_with_their_own_sampler_and_steps(monkeypatch: pytest.M
     ):
         monkeypatch.setattr(MODEL, "settings", model)
         levels.clear()
-        settings = DiffusionSettings(samples=1, guidance_steps=0, sampling_steps=steps)
-        Diffusion(settings).plan(PROBLEM, time_limit=1e-3)
+        Diffusion(DiffusionSettings(samples=1, guidance_steps=0, sampling_steps=steps)).plan(PROBLEM, time_limit=1e-3)
         assert len(levels) == calls and levels[0] == 1.0
 
 
@@ -107,8 +106,7 @@ def test_an_encoder_of_one_size_gets_clouds_of_that_size(monkeypatch: pytest.Mon
 def test_a_point_cloud_in_place_of_shapes() -> None:
     points = sample_surface(PROBLEM.scene, 4000, np.random.default_rng(0))
     problem = rd.Problem(PANDA, rd.Scene([rd.PointCloud(points, 0.01)]), LEFT, rd.JointGoal(RIGHT[None]))
-    result = Diffusion().plan(problem, time_limit=60.0)
-    assert rd.verify(PROBLEM, result.path).valid, "the ball lies within its points"
+    assert rd.verify(PROBLEM, Diffusion().plan(problem, time_limit=60.0).path).valid, "the ball lies within its points"
 
 
 def test_the_guidance_scale_reaches_the_network() -> None:

@@ -36,8 +36,7 @@ def clearances(motion: rd.Trajectory, obstacle: rd.MovingObstacle) -> list[float
 def test_motion_is_certified_in_time(obstacle: rd.MovingObstacle, jerk: float | None) -> None:
     task = problem(obstacle)
     planner = rd.load_planner("rrt_connect")
-    still = planner.plan(replace(task, moving=()), 10.0, until="first", jerk=jerk).trajectory
-    assert still is not None
+    assert planner.plan(replace(task, moving=()), 10.0, until="first", jerk=jerk).trajectory is not None
     found = planner.plan(task, 10.0, jerk=jerk)
     assert found.status is rd.Status.SOLVED, found.reason
     assert found.trajectory is not None and rd.verify(task, found.trajectory).valid
@@ -144,8 +143,7 @@ def test_motions_begin_with_the_start_velocity(velocity: np.ndarray) -> None:
     assert (np.abs(states.jerks) <= jerk_limits(PANDA)).all()
     assert not found.trajectory.accelerations[0].any()
     assert rd.verify(task, found.trajectory).valid
-    at_rest = rd.verify(replace(task, start_velocity=None), found.trajectory).violation
-    assert at_rest.kind in ("rest", "acceleration")
+    assert rd.verify(replace(task, start_velocity=None), found.trajectory).violation.kind in ("rest", "acceleration")
 
 
 def test_start_velocities_are_within_the_limits_or_rest() -> None:

@@ -73,9 +73,8 @@ def test_predicted_obstacles_are_kept_clear_of(planner: Planner, tmp_path: Path)
 
 
 def test_of_several_motions_the_one_that_sweeps_least_probability(planner: Planner) -> None:
-    everywhere = np.full(FINE.shape, np.float32(0.01))
     problem = partial("predicted")
-    chosen = unknown_space.plan_with_unknown_space(planner, problem, REQUEST, everywhere)
+    chosen = unknown_space.plan_with_unknown_space(planner, problem, REQUEST, np.full(FINE.shape, np.float32(0.01)))
     first = planner.attempt(replace(problem, views=()), PlanRequest(1.0))
     unknown = observe(problem.views, PANDA, START).unknown.repeat(2, 0).repeat(2, 1).repeat(2, 2)
     crossed = FINE.swept(PANDA, first.path) & unknown & ~FINE.filled(PANDA, (START, GOAL))
@@ -119,8 +118,7 @@ def test_assumptions_are_carved_free_at_the_ends() -> None:
     ends = np.concatenate([PANDA.placed_spheres(q) for q in (START, GOAL)]).astype(np.float32)
     solid = np.ones(FINE.shape, np.bool_)
     volume = observe([taken(DEEP)], PANDA, START)
-    policies = ("padded", "occupied")
-    chain = [one for p in policies for one in unknown_space.assumptions_of(partial(p), volume, None)]
+    chain = [one for p in ("padded", "occupied") for one in unknown_space.assumptions_of(partial(p), volume, None)]
     assert [assumption.padding for assumption in chain if isinstance(assumption, Padded)] == list(PADDINGS)
     for assumption in (*chain, OccupiedVoxels("all", solid, PANDA, rd.Scene())):
         cloud = assumption.obstacles(ends)

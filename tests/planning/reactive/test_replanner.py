@@ -3,8 +3,7 @@
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from itertools import count as counted
-from itertools import pairwise
+from itertools import count as counted, pairwise
 from threading import Lock
 from typing import Any
 
@@ -92,8 +91,7 @@ def test_a_late_step_finds_the_arm_where_the_last_command_left_it() -> None:
     for k in range(1, 15):
         command = replanner.step({}, k * PERIOD)
     assert np.abs(command.motion.velocities[0]).max() > 0.5
-    late = replanner.step({}, 15 * PERIOD + 3.0)
-    assert np.allclose(late.motion.positions[0], command.motion.positions[-1], atol=1e-9)
+    assert np.allclose(replanner.step({}, 15 * PERIOD + 3.0).motion.positions[0], command.motion.positions[-1], atol=1e-9)
 
 
 def test_steps_of_two_threads_follow_each_other() -> None:
@@ -187,8 +185,7 @@ def test_a_new_goal_is_reached_from_where_the_motion_ends(goal: str) -> None:
         if command.arrived:
             break
     assert command is not None and command.arrived and k > 15
-    reached = PANDA.fk(command.motion.positions[-1])
-    assert np.allclose(reached, PANDA.fk(rest if goal == "here" else START), atol=1e-4)
+    assert np.allclose(PANDA.fk(command.motion.positions[-1]), PANDA.fk(rest if goal == "here" else START), atol=1e-4)
 
 
 def test_a_goal_in_collision_leaves_the_old_one() -> None:
@@ -206,9 +203,8 @@ def test_limits_hold_at_every_time_however_often_the_arm_brakes(seed: int) -> No
     step = rng.choice([0.001, 0.005, 0.01])
     period = rng.choice([0.02, 0.0137])
     waypoints = np.cumsum(rng.normal(size=(5, 7)) * 0.3, axis=0)
-    line = rounded_line(waypoints, np.full(3, 0.1))
     filtered = JerkFilter(PANDA, jerk, step, waypoints[0])
-    path = TimedPath(PANDA, filtered.acceleration, line, True)
+    path = TimedPath(PANDA, filtered.acceleration, rounded_line(waypoints, np.full(3, 0.1)), True)
     given = SpeedProfile(np.zeros(2), np.zeros(2))
     dense = path.positions(path.on_then_rest(0.0, 0.0), np.arange(0.0, 20.0, 0.002))
     reach = motion_radii(PANDA).max(axis=0)

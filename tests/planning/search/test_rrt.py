@@ -20,7 +20,6 @@ from robotdiffuse.collision.motions import search_space
 from robotdiffuse.planning import context, start_goal
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.planning.search.rrt import AORRTC, AORRTCSettings, RRTConnect
-from robotdiffuse.planning.start_goal import retreat
 from robotdiffuse.problems.held_out import held_out_problem
 from robotdiffuse.trajectories.simplification import simplify, tighten
 from robotdiffuse.trajectories.timing import Timing, time_parameterize
@@ -33,13 +32,12 @@ ENDS = LEFT.astype(np.float32), RIGHT[None].astype(np.float32)
 def test_paths_are_below_the_bound_and_join_the_ends() -> None:
     space = search_space(CollisionChecker(PANDA, WALL), 0.04)
     start, goals = ENDS
-    longest = np.float32(1.0)
     bound = np.float32(np.inf)
     found = 0
     state = random_state(0)
     for _ in range(20):
         trees = rrt_kernel.make_trees(start, goals, 20_000)
-        path = rrt_kernel.search(space, None, trees, bound, longest, 5_000, state)
+        path = rrt_kernel.search(space, None, trees, bound, np.float32(1.0), 5_000, state)
         if not len(path):
             break
         assert path_length(path) <= bound + 1e-4
@@ -98,8 +96,7 @@ def test_the_clearance_is_kept_or_a_note_says_otherwise() -> None:
         assert result.scene_clearance is not None
         least = CollisionChecker(PANDA, WALL)
         segments = pairwise(result.trajectory.positions)  # rounded corners keep it too
-        dense = np.concatenate([np.linspace(a, b, 5) for a, b in segments])
-        assert least.link_clearances(dense).min() >= asked - 0.002
+        assert least.link_clearances(np.concatenate([np.linspace(a, b, 5) for a, b in segments])).min() >= asked - 0.002
         assert not any("clearance" in note for note in result.notes)
     wide = AORRTC().plan(replace(AROUND, clearance=0.05), 5.0)
     less = AORRTC().plan(replace(AROUND, clearance=0.05), 5.0, clearance=0.0)
@@ -174,10 +171,9 @@ def test_a_long_detour_is_replaced() -> None:
 
 def test_a_step_of_nearly_a_whole_turn_is_two_steps() -> None:
     """On the free way, a continuous joint turns by 5.84 rad, which the validator refuses as one step."""
-    gen3 = rd.load_robot("gen3")
     start = np.array([0.22, 1.4, 0.0, 0.3, 0.0, 0.0, 0.0])
     goal = np.array([-0.22, 1.4, 0.0, 0.3, 0.0, 0.0, 0.0])
-    problem = rd.Problem(gen3, rd.Scene([rd.Box([0.9, 0.0, 0.5], [0.8, 0.02, 1.6])]), start, goal)
+    problem = rd.Problem(rd.load_robot("gen3"), rd.Scene([rd.Box([0.9, 0.0, 0.5], [0.8, 0.02, 1.6])]), start, goal)
     result = AORRTC().plan(problem, until="first")
     assert result.solved and result.stage == "straight_line"
     assert rd.verify(problem, result.path).valid and rd.verify(problem, result.trajectory).valid
@@ -198,11 +194,10 @@ def test_a_line_that_is_always_refused_does_not_end_the_search(monkeypatch: pyte
 def test_ends_free_by_the_meshes_but_not_by_the_spheres_are_left_or_named(end, monkeypatch):
     """Regression: a start or goal without a way out was an immediate timeout."""
     ahead = PANDA.fk(HOME, "panda_hand")[:3, 3] - [0.0, 0.0, 0.2]
-    radii = np.arange(0.1, 0.05, -0.0002)
-    scenes = (rd.Scene([rd.Sphere(ahead, radius, name="ball")]) for radius in radii)
+    scenes = (rd.Scene([rd.Sphere(ahead, radius, name="ball")]) for radius in np.arange(0.1, 0.05, -0.0002))
     scene = next(scene for scene in scenes if explain_collision(PANDA, scene, HOME) is None)
     checker = CollisionChecker(PANDA, scene)
-    lead = retreat(checker, HOME)
+    lead = start_goal.retreat(checker, HOME)
     assert lead is not None and checker.free(np.stack([HOME, lead])).tolist() == [False, True]
     assert np.abs(lead - HOME).max() < 0.3
     monkeypatch.setattr(start_goal, "RETREAT_STEPS", 1)

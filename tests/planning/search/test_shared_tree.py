@@ -6,8 +6,7 @@ from math import gcd
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -26,9 +25,8 @@ TOUCHING = replace(ENDLESS, safety_distance=0.0)
 
 
 def two_joints():
-    pairs = (("l1", "l2"), ("l1", "l3"), ("l2", "l3"))
     arm = box_arm().with_locked({box_arm().joint_names[2]: 0.0})
-    return replace(arm, allowed_collisions=frozenset(map(frozenset, pairs)))
+    return replace(arm, allowed_collisions=frozenset(map(frozenset, (("l1", "l2"), ("l1", "l3"), ("l2", "l3")))))
 
 
 def grid_optimum(checker: CollisionChecker, start: np.ndarray, goal: np.ndarray, cells: int) -> float:
@@ -89,9 +87,8 @@ def test_rrt_star_alone_converges_to_the_optimum() -> None:
 @pytest.mark.parametrize("capacity", [1_000, 200])
 def test_the_tree_stays_a_tree(capacity: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shared_tree, "CAPACITY", capacity)
-    checker = CollisionChecker(PANDA, WALL)
     goals = RIGHT + np.pad([[0.0, 0.0, 0.0], [0.2, 0.2, 0.0], [0.1, -0.3, 0.3]], ((0, 0), (0, 4)))
-    search = SharedTreeSearch(checker, LEFT, goals, replace(TOUCHING, growth=200), random_state(2))
+    search = SharedTreeSearch(CollisionChecker(PANDA, WALL), LEFT, goals, replace(TOUCHING, growth=200), random_state(2))
     for _ in range(4):
         search.round()
     assert 64 < search.tree.sizes[0] <= capacity
@@ -178,14 +175,12 @@ def searched(checker: CollisionChecker, start: np.ndarray, distance: float) -> t
         search.round()
     path = search.path()
     assert path is not None
-    fine = [a + np.linspace(0, 1, 60)[:, None] * (b - a) for a, b in pairwise(path)]
-    return search, np.concatenate(fine)
+    return search, np.concatenate([a + np.linspace(0, 1, 60)[:, None] * (b - a) for a, b in pairwise(path)])
 
 
 def test_the_safety_distance_is_kept() -> None:
     checker = CollisionChecker(PANDA, WALL)
-    ends = checker.link_clearances(np.stack([LEFT, RIGHT])).min(axis=1)
-    assert (ends > 0.06).all()
+    assert (checker.link_clearances(np.stack([LEFT, RIGHT])).min(axis=1) > 0.06).all()
     for distance in (0.0, 0.05):
         search, fine = searched(checker, LEFT, distance)
         assert search.safety_distance == distance
@@ -215,8 +210,7 @@ def test_a_gap_too_narrow_for_the_distance_lowers_it() -> None:
     checker = CollisionChecker(arm, rd.Scene([rd.Sphere([0.87, 0.0, side * 0.16], 0.1) for side in (1, -1)]))
     start = np.array([-0.9])
     goal = np.array([0.9])
-    least = checker.link_clearances(np.linspace(start, goal, 200)).min()
-    assert 0.01 < least < 0.02
+    assert 0.01 < checker.link_clearances(np.linspace(start, goal, 200)).min() < 0.02
     search = SharedTreeSearch(checker, start, goal[None], ENDLESS, random_state(0))
     search.run(lambda: search.cost < np.inf)
     assert search.safety_distance == pytest.approx(0.01) and search.cost == pytest.approx(1.8)

@@ -34,8 +34,7 @@ def test_scenes_stand_on_the_ground_and_have_free_regions_in_reach(name: str) ->
         assert floor is furniture.FLOOR
         packed = PackedScenes.pack([furnished.scene], family.max_obstacles, floor=True)
         assert (packed.kinds > 0).sum() == len(shapes)
-        boxes = packed.params[packed.kinds == BOX]
-        assert (boxes[:, 7:9] == 0).all(), "turned about the vertical only"
+        assert (packed.params[packed.kinds == BOX][:, 7:9] == 0).all(), "turned about the vertical only"
         for shape in shapes:
             assert shape.bounds[0, 2] > -1e-12 and (distance(shape, BASE[:, :3]) > BASE[:, 3]).all()
         assert len(furnished.regions) >= 2

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import robotdiffuse as rd
 from helpers.commands import written
@@ -242,9 +241,8 @@ def test_files_are_looked_up_from_the_problem(tmp_path: Path, monkeypatch: pytes
     (tmp_path / "clouds").mkdir()
     np.save(tmp_path / "clouds" / "a.npy", [[0.5, 0, 0.2], [np.nan, 0, 0]])
     entry = {"point_cloud": {"file": "clouds/a.npy", "point_radius": 0.02}}
-    file = written(tmp_path, GOOD | {"scene": [entry]})
     monkeypatch.chdir("/")
-    loaded = rd.load_problem(file)
+    loaded = rd.load_problem(written(tmp_path, GOOD | {"scene": [entry]}))
     assert len(loaded.notes) == 1 and "1 of 2 points are not finite" in loaded.notes[0]
     save_problem(loaded, tmp_path / "again.json")
     assert json.loads((tmp_path / "again.json").read_text())["scene"] == [entry]

@@ -46,23 +46,19 @@ def test_files_keep_tools_and_objects(extra: dict[str, Any], tmp_path: Path) -> 
 
 
 def test_a_goal_may_name_the_tool_and_what_is_held(tmp_path: Path) -> None:
-    down = [0.0, 1.0, 0.0, 0.0]
     for frame, extra in (("tool", {"tool": TOOL}), ("cup", {"attached": [CUP]})):
-        goal = {"pose": {"frame": frame, "xyz": [0.45, 0.3, 0.3], "wxyz": down}}
+        goal = {"pose": {"frame": frame, "xyz": [0.45, 0.3, 0.3], "wxyz": [0.0, 1.0, 0.0, 0.0]}}
         problem = rd.load_problem(written(tmp_path, PLAIN | extra | {"goal": goal}))
         result = rd.plan(problem, time_limit=10.0)
         assert result.path is not None, result.reason
-        T = problem.robot.fk(result.path.positions[-1], frame)
-        assert np.allclose(T[:3, 3], [0.45, 0.3, 0.3], atol=1e-4)
+        assert np.allclose(problem.robot.fk(result.path.positions[-1], frame)[:3, 3], [0.45, 0.3, 0.3], atol=1e-4)
 
 
 def test_base_moves_scene_goal_and_views_into_the_bases_frame() -> None:
     robot = rd.load_robot("panda")
-    T_world_goal = T_WORLD_BASE @ robot.fk(GOAL, "panda_hand")
     view = rd.DepthView(np.full((4, 4), 5.0), (4, 4, 2, 2), T_WORLD_BASE)
-    scene = rd.Scene(SHAPES).moved(T_WORLD_BASE)
-    goal = rd.PoseGoal("panda_hand", T_world_goal)
-    problem = rd.Problem.in_world(T_WORLD_BASE, robot, scene, START, goal, views=[view])
+    goal = rd.PoseGoal("panda_hand", T_WORLD_BASE @ robot.fk(GOAL, "panda_hand"))
+    problem = rd.Problem.in_world(T_WORLD_BASE, robot, rd.Scene(SHAPES).moved(T_WORLD_BASE), START, goal, views=[view])
     assert isinstance(problem.goal, rd.PoseGoal)
     assert np.allclose(problem.goal.T_base_frame, robot.fk(GOAL, "panda_hand"))
     assert np.allclose(problem.views[0].T_base_camera, np.eye(4))
@@ -113,8 +109,7 @@ def test_pybullet_sees_no_contact_where_the_robot_stands_in_the_world() -> None:
     standing, _ = problem.robot_and_scene_in_world()
     with PyBulletOracle(standing, rd.Scene([wall])) as oracle:
         assert oracle.check_path(result.path) is None
-        straight = rd.Path(robot.joint_names, np.array([START, GOAL]))
-        contact = oracle.check_path(straight)
+        contact = oracle.check_path(rd.Path(robot.joint_names, np.array([START, GOAL])))
         assert contact is not None and {contact.link, contact.other} <= {"cup", "wall", "panda_hand"}
 
 

@@ -35,19 +35,17 @@ def test_rare_collision_is_found_by_descent() -> None:
     robot = limited(box_arm(), 2.2)
     few = SamplingSettings(samples=100)
     for seed in range(3):
-        reports = find_allowed_collisions(robot, few, np.random.default_rng(seed))
-        (pair,) = (r for r in reports if r.links == ("l1", "l3"))
+        (pair,) = (r for r in find_allowed_collisions(robot, few, np.random.default_rng(seed)) if r.links == ("l1", "l3"))
         assert pair.reason == "checked"
 
 
 def overlapping(lower: float, own: bool = True) -> Robot:
     """A robot with links a and c, two joints apart, whose meshes overlap while joint 2 is near zero."""
     z = np.array([0, 0, 1.0])
-    kind = "revolute" if own else "fixed"
     joints = [
         Joint("1", "revolute", "a", "b", np.eye(4), z, -1.0, 1.0),
         Joint("2", "prismatic", "b", "m", np.eye(4), z, lower, 1.0),
-        Joint("3", kind, "m", "c", transform(np.array([0.0, 0.0, 0.05])), z, -1.0, 1.0),
+        Joint("3", "revolute" if own else "fixed", "m", "c", transform(np.array([0.0, 0.0, 0.05])), z, -1.0, 1.0),
     ]
     cube = (box_mesh(np.full(3, -0.05), np.full(3, 0.05)),)
     tip = "c" if own else "m"
@@ -96,8 +94,7 @@ def thick(bound: float) -> Robot:
     """An arm whose first and last link collide in half of a joint's range, as the meshes of Baxter's forearm and wrist do,
     although the real links do not; the range is evidence of a stop only below a full turn."""
     wide = limited(box_arm(), bound)
-    last = wide.joint_names[2]
-    joints = tuple(replace(j, lower=-0.2, upper=0.2) if j.name == last else j for j in wide.joints)
+    joints = tuple(replace(j, lower=-0.2, upper=0.2) if j.name == wide.joint_names[2] else j for j in wide.joints)
     (box,) = wide.meshes["l1"]
     meshes = wide.meshes | {"l1": (ConvexMesh(box.vertices * (1, 16, 1), box.faces),)}
     return replace(wide, joints=joints, meshes=meshes, spheres=wide.spheres | {"l1": np.array([[0.25, 0, 0, 0.6]])})
@@ -139,8 +136,7 @@ def test_pairs_that_need_no_check_are_found(case: str) -> None:
 @pytest.mark.parametrize("reason", ["default", "limits", "pose"])
 def test_pairs_that_meet_and_are_not_checked_are_told(reason: str) -> None:
     pairs = (PairReport(("l1", "l3"), reason, 0.27), PairReport(("l1", "l2"), "adjacent", 1.0))
-    report = AddReport(box_arm(), Path(), (), pairs, FalseCollisions(0.7, 0.0, 0.0, ()), 0.0, 0)
-    (warning,) = report.warnings
+    (warning,) = AddReport(box_arm(), Path(), (), pairs, FalseCollisions(0.7, 0.0, 0.0, ()), 0.0, 0).warnings
     assert "l1 against l3 is not checked" in warning and "27.0%" in warning
 
 

@@ -131,8 +131,7 @@ def test_tables_say_no_more_than_the_parts(pair: tuple[str, str]) -> None:
 def test_intervals_are_apart_if_all_that_is_within_them_is() -> None:
     """Intervals along a joint with limits, and along a continuous one."""
     rng = np.random.default_rng(0)
-    apart = rng.random((8, 8)) < 0.9
-    table = LinkPairTable(PAIR, ("a", "b"), (-1.0, -np.pi), (1.0, np.pi), apart)
+    table = LinkPairTable(PAIR, ("a", "b"), (-1.0, -np.pi), (1.0, np.pi), rng.random((8, 8)) < 0.9)
     low = [rng.uniform(-1.4, 1.2, 40), rng.uniform(-9, 8, 40)]
     high = [low[0] + rng.uniform(0, 0.5, 40), low[1] + rng.uniform(0, 2, 40)]
     found = table.throughout(*zip(low, high, strict=True))

@@ -32,9 +32,7 @@ def beyond(parts: tuple, points: np.ndarray) -> np.ndarray:
     return np.min([(points @ n.T - o).max(1) for n, o in map(convex_parts.planes_of, parts)], axis=0)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_MESHES else []) for name in MESHES]
-)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW_MESHES)) for name in MESHES])
 def test_parts_hold_all_of_the_mesh(name: str) -> None:
     parts = parts_of(name)
     assert beyond(parts, trimesh.sample.sample_surface(MESHES[name], 20_000, seed=1)[0]).max() < 1e-9
@@ -66,8 +64,7 @@ def test_parts_stick_out_little_about_tight_places() -> None:
     assert len(whole) == 1 < len(parts)
     # an eighth of the tolerance, and a voxel: 0.034 m, from the frame's bars, which end at 0.05 m
     assert beyond(whole, tight + 0.03)[0] < 0 < beyond(parts, tight + 0.03)[0]
-    points = trimesh.sample.sample_surface(FRAME, 5000, seed=1)[0]
-    assert beyond(parts, np.asarray(points)).max() < 1e-6
+    assert beyond(parts, np.asarray(trimesh.sample.sample_surface(FRAME, 5000, seed=1)[0])).max() < 1e-6
 
 
 def test_simplified_hulls_hold_the_hull() -> None:

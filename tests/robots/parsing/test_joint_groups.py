@@ -127,8 +127,7 @@ def test_mimic_joints_follow(tmp_path: Path) -> None:
 
 
 def test_mimics_of_planned_joints_raise_unless_they_are_locked(tmp_path: Path) -> None:
-    follow = '<mimic joint="j2" multiplier="-1"/>'
-    bar = link("bar") + joint("rod", "j1_link", "bar", more=follow)
+    bar = link("bar") + joint("rod", "j1_link", "bar", more='<mimic joint="j2" multiplier="-1"/>')
     refuses(
         r"rod mimics j2, which is planned; .*--lock j2=VALUE.*, or remove rod and what it carries",
         read_urdf,
@@ -136,8 +135,7 @@ def test_mimics_of_planned_joints_raise_unless_they_are_locked(tmp_path: Path) -
     )
     held = read_urdf(written(tmp_path, ARM, bar), locked={"j2": 0.5})
     assert held.locked == {"rod": -0.5, "j2": 0.5} and held.dof == 5
-    bare = bar.replace(link("bar"), link("bar", ""))
-    framed = read_urdf(written(tmp_path, ARM, bare))
+    framed = read_urdf(written(tmp_path, ARM, bar.replace(link("bar"), link("bar", ""))))
     assert framed.dof == 6 and "the pose of bar is wrong" in "".join(framed.notes)
     inside = link("end") + joint("last", "j6_link", "end", more='<mimic joint="j5"/>')
     refuses("last mimics j5", read_urdf, written(tmp_path, ARM, inside), tip="end")

@@ -78,8 +78,7 @@ def arm(file: Path, tmp_path_factory: pytest.TempPathFactory) -> rd.Robot:
 def state_of(model: Any, robot: rd.Robot, q: np.ndarray) -> Any:
     """MuJoCo's data at a configuration of the robot; other joints have their locked values."""
     data = mujoco.MjData(model)
-    values = dict(zip(robot.joint_names, q, strict=True)) | robot.locked
-    for name, value in values.items():
+    for name, value in (dict(zip(robot.joint_names, q, strict=True)) | robot.locked).items():
         data.qpos[model.joint(name).qposadr] = value
     mujoco.mj_forward(model, data)
     return data
@@ -100,8 +99,7 @@ def test_frames_limits_poses_and_mimics_are_those_of_mujoco(file: Path) -> None:
             np.testing.assert_allclose(T[:3, 3], position, atol=1e-9)
             np.testing.assert_allclose(T[:3, :3], rotation.reshape(3, 3), atol=1e-9)
     np.testing.assert_allclose([robot.lower[1], robot.upper[1]], [-0.1, 0.2])
-    j2 = next(joint for joint in robot.joints if joint.name == "j2")
-    assert j2.effort == 20
+    assert next(joint for joint in robot.joints if joint.name == "j2").effort == 20
     assert robot.locked["f2"] == pytest.approx(0.01 + 0.001 + robot.locked["f1"])
     assert robot.poses["home"] == {"j1": 0.5, "lift": 0.1, "j2": 0.4, "j3": -0.3, "f1": 0.01, "f2": 0.02}
     assert any("no velocity limit" in note for note in robot.notes)
@@ -135,8 +133,7 @@ def test_a_scene_is_all_that_is_not_the_robot(file: Path) -> None:
     assert [shape.name for shape in scene.shapes] == ["floor", "crate_wall"]
     assert floor.bounds[1, 2] == pytest.approx(-0.5)
     np.testing.assert_allclose(crate.bounds, [[0.55, -0.1, 0.2], [0.65, 0.3, 0.4]])
-    raised = rd.Scene.from_mujoco(model, data, base="base")
-    np.testing.assert_allclose(raised.shapes[0].bounds[1, 2], -0.55)
+    np.testing.assert_allclose(rd.Scene.from_mujoco(model, data, base="base").shapes[0].bounds[1, 2], -0.55)
     refuses("body", rd.Scene.from_mujoco, model, base="bse")
 
 
@@ -317,8 +314,7 @@ TURNED = """
 
 
 def test_mirrored_meshes_are_where_mujoco_has_them_and_what_is_not_driven_is_none(tmp_path: Path) -> None:
-    part = trimesh.creation.box([0.1, 0.2, 0.1]).apply_translation([0.02, 0.05, 0.0])
-    part.export(tmp_path / "part.stl")
+    trimesh.creation.box([0.1, 0.2, 0.1]).apply_translation([0.02, 0.05, 0.0]).export(tmp_path / "part.stl")
     (tmp_path / "m.xml").write_text(TURNED)
     tree = UrdfTree(tmp_path / "m.xml", {})
     robot = tree.robot()
@@ -347,5 +343,4 @@ def test_meshes_that_collide_are_hulls_as_for_mujoco(tmp_path: Path) -> None:
     (tmp_path / "m.xml").write_text(HOLLOW.format(*numbers))
     [surface] = UrdfTree(tmp_path / "m.xml", {}).surfaces("base")
     bounds = surface.vertices.max(axis=0) - surface.vertices.min(axis=0)
-    volume = trimesh.Trimesh(surface.vertices, surface.faces).volume
-    np.testing.assert_allclose(volume, np.prod(bounds), rtol=1e-6)
+    np.testing.assert_allclose(trimesh.Trimesh(surface.vertices, surface.faces).volume, np.prod(bounds), rtol=1e-6)

@@ -16,7 +16,6 @@ from helpers.made_arms import BALL, chain, joint, link, read_urdf, row, written
 from helpers.quick_preparation import QUICK, coarse_grids
 from helpers.refusals import refuses
 from robotdiffuse.core import output_files
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
 from robotdiffuse.robots import load_robot, robot_folder
 from robotdiffuse.robots.fitting import preparation
@@ -194,8 +193,7 @@ def test_limits_file(tmp_path: Path) -> None:
 def test_limits_of_a_file_decide_which_joints_are_held(tmp_path: Path) -> None:
     """A joint with equal new limits was planned, which inverse kinematics cannot do; a held joint stayed outside of its."""
     tree = UrdfTree(urdf(tmp_path, ARM.replace("</robot>", GRIPPER)), {})
-    limits = {"bend": {"lower": 0.5, "upper": 0.5, "velocity": 2.0}, "grip": {"lower": 0.02}}
-    robot = tree.robot(limits=limits)
+    robot = tree.robot(limits={"bend": {"lower": 0.5, "upper": 0.5, "velocity": 2.0}, "grip": {"lower": 0.02}})
     assert robot.joint_names == ("turn",)
     assert robot.locked == {"bend": 0.5, "grip": 0.02, "grip2": 0.02}
     assert not any("no velocity limit" in note for note in robot.notes)
@@ -327,7 +325,7 @@ def test_a_robot_that_is_written_again_is_never_a_mixture(tmp_path: Path, monkey
     with pytest.raises(KeyboardInterrupt):
         write_robot_folder(robot, tmp_path, {})
     assert not (tmp_path / "robot.json").exists()
-    with output_files.lock_folder(tmp_path), pytest.raises(InputError, match="another process is filling"):
+    with output_files.lock_folder(tmp_path), pytest.raises(rd.InputError, match="another process is filling"):
         write_robot_folder(robot, tmp_path, {})
 
 
@@ -447,8 +445,7 @@ def test_xacro_includes_files_beside_it(tmp_path: Path, monkeypatch: pytest.Monk
     mesh(tmp_path / "some_arm")
     (tmp_path / "some_arm" / "part").mkdir()
     xacro(tmp_path / "some_arm" / "part", PARTS, "arm.xacro")
-    content = link("base") + '<xacro:include filename="part/arm.xacro"/>'
-    file = xacro(tmp_path / "some_arm", content, "made.urdf")
+    file = xacro(tmp_path / "some_arm", link("base") + '<xacro:include filename="part/arm.xacro"/>', "made.urdf")
     monkeypatch.chdir("/")
     assert read_urdf(file).dof == 4
 
@@ -475,13 +472,11 @@ def test_xacro_that_cannot_be_compiled_says_what_helps(tmp_path: Path, monkeypat
 def test_only_robot_add_compiles_xacro(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Regression: a problem, result or certificate that names a URDF ran the code in the URDF's expressions."""
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
-    namespace = "http://www.ros.org/wiki/xacro"
-    property_ = f'<x:property xmlns:x="{namespace}" name="a" value="1"/>'
     for name, content in (
         ("named.urdf.xacro", PARTS),
         ("arm.XACRO.xml", PARTS),
         ("prefix.urdf", '<xacro:property name="a" value="1"/>' + PARTS),
-        ("namespace.urdf", property_ + PARTS),
+        ("namespace.urdf", '<x:property xmlns:x="http://www.ros.org/wiki/xacro" name="a" value="1"/>' + PARTS),
         ("expression.urdf", PARTS.replace('name="j1"', 'name="${[].clear()}"')),
         ("argument.urdf", PARTS.replace('name="j1"', 'name="$(arg prefix)"')),
     ):
@@ -492,8 +487,7 @@ def test_only_robot_add_compiles_xacro(tmp_path: Path, monkeypatch: pytest.Monke
 def test_a_urdf_that_xacro_wrote_is_no_xacro(tmp_path: Path) -> None:
     """Such a URDF still declares the namespace of xacro."""
     mesh(tmp_path)
-    file = xacro(tmp_path, link("base") + PARTS, "made.urdf")
-    assert UrdfTree(file, {}).robot().dof == 4
+    assert UrdfTree(xacro(tmp_path, link("base") + PARTS, "made.urdf"), {}).robot().dof == 4
 
 
 def test_blanks_of_file_names_may_be_escaped(tmp_path: Path) -> None:

@@ -154,8 +154,7 @@ def test_files_are_loaded_and_saved_and_broken_ones_are_a_note(view: Any, page: 
     assert Path(saved.value.path()).read_bytes().startswith(b"<!doctype html>")
     before = session.state.problem
     upload = view.locator("input[type=file]")
-    broken = {"name": "broken.yaml", "mimeType": "text/yaml", "buffer": b"robot: panda\nscene: 3\n"}
-    upload.set_input_files(broken)
+    upload.set_input_files({"name": "broken.yaml", "mimeType": "text/yaml", "buffer": b"robot: panda\nscene: 3\n"})
     view.get_by_text("broken.yaml: problem has no start").wait_for()
     assert session.state.problem is before
     other = live.problem_text(live.first_problem(None, "ur5e"))

@@ -207,9 +207,8 @@ CORNERS = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
 )
 def test_shapes_go_where_their_handles_are_put(shape) -> None:
     T = transform(np.array([0.5, -0.2, 0.7]), rotation_about(np.array([0.6, 0.0, 0.8]), 1.0))
-    at = own_frame(live.moved_to(shape, T))
     turned = shape.kind not in ("sphere", "point_cloud")
-    np.testing.assert_allclose(at, T if turned else transform(T[:3, 3]), atol=1e-12)
+    np.testing.assert_allclose(own_frame(live.moved_to(shape, T)), T if turned else transform(T[:3, 3]), atol=1e-12)
     for name, value in live.dimensions(shape).items():
         assert live.dimensions(live.resized(shape, name, value + 0.1)) == {**live.dimensions(shape), name: value + 0.1}
         refuses(r"must be", live.resized, shape, name, 0.0)

@@ -185,18 +185,16 @@ LINKS = ("hand", "finger")
 
 def matrix(names: list[str], pairs: list[tuple[str, str]], **defaults: bool) -> dict[str, Any]:
     enabled = {frozenset(pair) for pair in pairs}
-    rows = [{"enabled": [frozenset((a, b)) in enabled for b in names]} for a in names]
     return {
         "entry_names": names,
-        "entry_values": rows,
+        "entry_values": [{"enabled": [frozenset((a, b)) in enabled for b in names]} for a in names],
         "default_entry_names": list(defaults),
         "default_entry_values": list(defaults.values()),
     }
 
 
 def test_pairs_of_links_and_objects_count_and_defaults_decide_where_no_pair_does() -> None:
-    names = ["hand", "finger", "can", "stale"]
-    data = matrix(names, [("hand", "can"), ("hand", "finger"), ("stale", "can")])
+    data = matrix(["hand", "finger", "can", "stale"], [("hand", "can"), ("hand", "finger"), ("stale", "can")])
     assert moveit.matrix_contacts(data, ["can", "board"], LINKS) == {"can": ("hand",)}
     data = matrix(["hand", "can"], [], can=True, board=True, finger=False)
     assert moveit.matrix_contacts(data, ["can", "board"], LINKS) == {"board": ("hand",)}
@@ -228,9 +226,7 @@ UR5_JOINTS = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", *(f"wr
 
 def ur5_files(folder: Path, model: str, more: list[str]) -> Path:
     """A problem file of `ur5`, with a MoveIt scene and request of a robot that has further joints."""
-    names = [*UR5_JOINTS, *more]
-    zeros = [0.0] * (6 + len(more))
-    here = {"joint_state": {"name": names, "position": zeros}}
+    here = {"joint_state": {"name": [*UR5_JOINTS, *more], "position": [0.0] * (6 + len(more))}}
     here["multi_dof_joint_state"] = {"joint_names": ["virtual_joint"]}
     goal = [{"joint_name": name, "position": 0.1} for name in UR5_JOINTS]
     scene = {"robot_model_name": model, "robot_state": here, "world": {}}
@@ -259,8 +255,7 @@ def test_files_of_another_robot_are_refused_by_its_joints(tmp_path: Path) -> Non
 
 
 def test_joints_that_the_robot_lacks_can_be_ignored_and_another_model_name_is_a_note(tmp_path: Path) -> None:
-    file = ur5_files(tmp_path, "ur5_robotiq85", ["gripper_finger1_joint"])
-    notes = rd.load_problem(file, ignore_joints=True).notes
+    notes = rd.load_problem(ur5_files(tmp_path, "ur5_robotiq85", ["gripper_finger1_joint"]), ignore_joints=True).notes
     assert "the scene's robot_model_name is ur5_robotiq85; planned for ur5" in notes
     assert "start_state.joint_state: ignored gripper_finger1_joint, which ur5 lacks" in notes
     [entry] = load_motion_bench_maker(tmp_path, rd.load_robot("ur5"), ignore_joints=True)
@@ -345,9 +340,8 @@ def test_wide_tolerances_of_a_pose_goal_are_noted() -> None:
 @pytest.mark.parametrize("frame", ["panda_hand", "world"])
 def test_objects_are_held_at_the_start(frame: str, tmp_path: Path) -> None:
     bare = asked(tmp_path, request_data()).load()
-    T_base_hand = bare.robot.fk(bare.start, "panda_hand")
     T_hand_rod = transform(np.array([0.0, 0.0, 0.2]))
-    T = T_base_hand @ T_hand_rod if frame == "world" else T_hand_rod
+    T = bare.robot.fk(bare.start, "panda_hand") @ T_hand_rod if frame == "world" else T_hand_rod
     x, y, z, w = np.roll(quaternion_from_rotation(T[:3, :3]), -1).tolist()
     held = {
         "link_name": "panda_hand",
@@ -359,8 +353,7 @@ def test_objects_are_held_at_the_start(frame: str, tmp_path: Path) -> None:
             "primitive_poses": [{"position": T[:3, 3].tolist(), "orientation": [x, y, z, w]}],
         },
     }
-    data = change(request_data(), ["start_state", "attached_collision_objects"], [held])
-    problem = asked(tmp_path, data).load()
+    problem = asked(tmp_path, change(request_data(), ["start_state", "attached_collision_objects"], [held])).load()
     [rod] = problem.robot.attached
     assert rod.name == "rod" and rod.touch_links == ("panda_link6",)
     np.testing.assert_allclose(rod.T_link_body, T_hand_rod, atol=1e-9)
