@@ -39,8 +39,7 @@ print(main(["train", "encoder", "--out", "nowhere"]))
 def test_without_pytorch_all_but_its_planners_and_training_works() -> None:
     said = python(BLOCKED).stdout.splitlines()
     assert said[0] == "True False", "the default planner loads no network"
-    planned = [f"{name} True True" for name in ("robotdiffuse", "diffusion", "mpd", "edmp")]
-    assert said[1:6] == [*planned, "certified True"]
+    assert said[1:6] == [*[f"{name} True True" for name in ("robotdiffuse", "diffusion", "mpd", "edmp")], "certified True"]
     assert said[6] == "True True True", "a scene that a camera saw, with predicted unknown space"
     for name, line in zip(("mpnet", "mpinets"), said[7:9], strict=True):
         assert line == f'the planner {name} needs torch, not installed: pip install "robotdiffuse[train]"'

@@ -23,8 +23,7 @@ HAND = "panda_hand"
 
 
 def planner(**options: object) -> Planner:
-    values = {"user_joint_names": JOINTS + FINGERS, "srdf": ""} | options
-    return Planner("panda", HAND, **values)  # type: ignore[arg-type]
+    return Planner("panda", HAND, **{"user_joint_names": JOINTS + FINGERS, "srdf": ""} | options)  # type: ignore[arg-type]
 
 
 @pytest.fixture
@@ -60,8 +59,7 @@ def test_rows_begin_after_the_start_and_last_until_controllers_have_settled() ->
 def test_fingers_need_not_be_equally_far_open(made: Planner) -> None:
     """Regression: the second finger mimics the first. In a grasp they differ by a millimeter, and the call was refused."""
     first, second = FINGERS
-    follows = Mimic(first, 1.0, 0.0)
-    joints = [replace(joint, mimic=follows if joint.name == second else None) for joint in made.robot.joints]
+    joints = [replace(joint, mimic=Mimic(first, 1.0, 0.0) if joint.name == second else None) for joint in made.robot.joints]
     made.workspace.robot = replace(made.robot, joints=tuple(joints))
     assert made.check_for_self_collision([*QPOS[:7], 0.0205, 0.0213]) == []
     assert made.workspace.robot.locked == {first: 0.02, second: 0.02}
@@ -99,8 +97,7 @@ def test_a_screw_is_a_straight_line(made: Planner) -> None:
 
 
 def test_obstacles_and_held_objects_count(made: Planner) -> None:
-    grid = np.mgrid[-0.1:0.1:5j, -0.1:0.1:5j, -0.1:0.1:5j].reshape(3, -1).T
-    made.update_point_cloud(grid + POSE[:3], resolution=0.03)
+    made.update_point_cloud(np.mgrid[-0.1:0.1:5j, -0.1:0.1:5j, -0.1:0.1:5j].reshape(3, -1).T + POSE[:3], resolution=0.03)
     assert made.check_for_env_collision(np.r_[made.workspace.ik(matrix(POSE), near=QPOS[:7])[0], QPOS[7:]])
     assert "collision" in made.plan_pose(POSE, QPOS)["status"]
     assert made.IK(POSE, QPOS)[0].startswith("IK Failed!")

@@ -119,8 +119,7 @@ def test_trained_weights_are_read_and_the_same_seed_gives_the_same_path(tmp_path
     # weights are stored in half precision
     assert torch.allclose(network(cloud, q, q), planner.network(PANDA)(cloud, q, q), atol=1e-3)
     # the untrained policy makes some steps before it is near enough by chance
-    goal = LEFT + np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0, 0.0])
-    problem = Problem(PANDA, Scene([Sphere([0.0, 0.0, 1.5], 0.1)]), LEFT, goal)
+    problem = Problem(PANDA, Scene([Sphere([0.0, 0.0, 1.5], 0.1)]), LEFT, LEFT + np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0, 0.0]))
     paths = [planner.plan(problem, 20.0, seed).path for seed in (5, 5)]
     assert np.array_equal(paths[0].positions, paths[1].positions)
     assert len(paths[0].positions) > 2

@@ -83,12 +83,10 @@ def test_bounds_in_time_are_bounds() -> None:
     q = np.array(START) + 0.2 * np.random.default_rng(1).normal(size=(6, 7)).cumsum(axis=0)
     prover = MovingProver(PANDA, ways, q, times, np.zeros_like(q[1:]))
     count = len(prover.claims)
-    whole = Stretches(np.arange(count), np.full(count, 1.2), np.full(count, 1.9))
-    found = prover.bounds(whole, np.zeros(count, bool), [])
+    found = prover.bounds(Stretches(np.arange(count), np.full(count, 1.2), np.full(count, 1.9)), np.zeros(count, bool), [])
     for place in np.linspace(1.2, 1.9, 15):
         point = Stretches(np.arange(count), np.full(count, place), np.full(count, place))
-        there = prover.bounds(point, np.zeros(count, bool), [])
-        assert (there.clearance >= found.clearance - found.displacement - 1e-9).all()
+        assert (prover.bounds(point, np.zeros(count, bool), []).clearance >= found.clearance - found.displacement - 1e-9).all()
 
 
 def refused(certificate: rd.Certificate, problem: rd.Problem, wanted: str) -> None:

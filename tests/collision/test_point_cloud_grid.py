@@ -69,8 +69,7 @@ def test_points_just_beyond_the_reach_count() -> None:
 
 @pytest.mark.parametrize("radius", [1e-9, 1e-4, 0.3])
 def test_tiny_and_large_points(radius: float) -> None:
-    points = np.random.default_rng(0).uniform([-0.8, -0.8, 0.0], [0.8, 0.8, 1.2], (20, 3))
-    scene = rd.Scene([rd.PointCloud(points, radius)])
+    scene = rd.Scene([rd.PointCloud(np.random.default_rng(0).uniform([-0.8, -0.8, 0.0], [0.8, 0.8, 1.2], (20, 3)), radius)])
     q = oracles.rows(PANDA, 500)
     hit = (oracles.link_distances(PANDA, scene, q) < -oracles.TOLERANCE).any(axis=1)
     assert not CollisionChecker(PANDA, scene).free(q)[hit].any()

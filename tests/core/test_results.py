@@ -23,8 +23,7 @@ FULL = OSError(28, "No space left on device")
 @pytest.fixture
 def solved() -> rd.PlanResult:
     rng = np.random.default_rng(0)
-    times = np.cumsum(np.array([0.0, 0.1, 0.1, 0.07]))
-    trajectory = rd.Trajectory(NAMES, times, *(rng.normal(size=(4, 2)) for _ in range(3)))
+    trajectory = rd.Trajectory(NAMES, np.cumsum(np.array([0.0, 0.1, 0.1, 0.07])), *(rng.normal(size=(4, 2)) for _ in range(3)))
     path = rd.Path(NAMES, trajectory.positions[[0, 3]])
     found = rd.Status.SOLVED, "found by a straight line", "rrt_connect", "panda", 0.01, 3, "straight line", path, trajectory
     more = {"min_clearance": 0.02, "scene_clearance": 0.02, "self_clearance": 0.05, "notes": ("start clamped",)}

@@ -47,8 +47,7 @@ def test_export_for_the_authors(tmp_path):
     np.testing.assert_array_equal(x[-1], arrays["trajectories"][0])
     centers = arrays["obstacle_params"][0, [0, 3], :3].reshape(-1)
     goal = arrays["goals"][0, arrays["goal_index"][0]]
-    expected = np.concatenate([arrays["start"][0], goal, centers, arrays["target_pose"][0, 4:]])
-    np.testing.assert_array_equal(y[-1], expected)
+    np.testing.assert_array_equal(y[-1], np.concatenate([arrays["start"][0], goal, centers, arrays["target_pose"][0, 4:]]))
     np.testing.assert_array_equal(y[:, :14], np.concatenate([x[:, 0], x[:, -1]], 1))
     refuses(r"the folder .*nothing does not exist", export_npz, tmp_path, tmp_path / "nothing" / "robot.npz")
 

@@ -135,8 +135,7 @@ def test_bad_input(store, tmp_path):
 
     def damaged():
         shard(WAYPOINTS)
-        chunks = (shards.shard_path(tmp_path, 0) / "trajectories" / "c").rglob("*")
-        next(p for p in chunks if p.is_file()).write_bytes(b"")
+        next(p for p in (shards.shard_path(tmp_path, 0) / "trajectories" / "c").rglob("*") if p.is_file()).write_bytes(b"")
 
     for change, message in [
         (lambda: None, "no data set"),

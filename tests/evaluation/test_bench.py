@@ -107,8 +107,7 @@ def test_a_metric_of_an_imported_module_is_measured(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(registry, "imported", [])
     try:
         registry.import_modules(["counted"])
-        asked = replace(settings(tmp_path / "run", "rrt_connect", count=1), time_limit=60.0)
-        assert bench.run_bench(asked, quiet, quiet) == 1
+        assert bench.run_bench(replace(settings(tmp_path / "run", "rrt_connect", count=1), time_limit=60.0), quiet, quiet) == 1
         (record,) = read_records(tmp_path / "run")["rrt_connect"]
         assert record.measures["legs"] == len(record.waypoints) - 1
     finally:
@@ -247,8 +246,7 @@ def test_nontrivial_problems_are_not_solved_by_the_line(tmp_path: Path) -> None:
     cases = gather_cases(["rop_nontrivial", "rop"], 2, tmp_path, quiet)
     hard = [case for case in cases if case.problem_set == "rop_nontrivial"]
     assert len(hard) == 2 and not any(case.trivial or line_length(case.problem, validator) for case in hard)
-    again = gather_cases(["rop_nontrivial", "rop"], 2, tmp_path, quiet)
-    assert [case.key for case in again] == [case.key for case in cases]
+    assert [case.key for case in gather_cases(["rop_nontrivial", "rop"], 2, tmp_path, quiet)] == [case.key for case in cases]
     assert [case.name for case in gather_cases(["rop"], 5, tmp_path, quiet)] == [f"rop/{i}" for i in range(5)]
     np.testing.assert_array_equal(cases[2].problem.start, held_out_problem("rop", 0).start)
 

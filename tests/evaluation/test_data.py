@@ -175,8 +175,7 @@ def test_picked_rows_do_not_repeat():
     assert picked.keys() == sizes.keys() and sum(map(len, picked.values())) == 10
     for index, rows in picked.items():
         assert len(set(rows.tolist())) == len(rows) and all(0 <= row < sizes[index] for row in rows)
-    every = [rows.tolist() for rows in pick_rows(sizes, None, 0).values()]
-    assert every == [list(range(size)) for size in sizes.values()]
+    assert [rows.tolist() for rows in pick_rows(sizes, None, 0).values()] == [list(range(size)) for size in sizes.values()]
 
 
 @pytest.fixture

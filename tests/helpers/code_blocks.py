@@ -84,8 +84,7 @@ def code_blocks(page: Path) -> list[Block]:
 def a_cloud(folder: Path) -> None:
     """Writes cloud.ply: the points of a wall beside the arm."""
     side = np.linspace(-0.3, 0.3, 30)
-    points = np.stack(np.meshgrid([0.8], side, side + 0.4), axis=-1).reshape(-1, 3)
-    trimesh.PointCloud(points).export(folder / "cloud.ply")
+    trimesh.PointCloud(np.stack(np.meshgrid([0.8], side, side + 0.4), axis=-1).reshape(-1, 3)).export(folder / "cloud.ply")
 
 
 @cache

@@ -35,8 +35,7 @@ def serving(
         found = re.search(r"http://[^;]+", process.stdout.readline())
         assert found is not None and "ready" in process.stdout.readline()
         # a kept connection may be closed by the server in the moment in which it is used again
-        limits = httpx.Limits(max_keepalive_connections=0)
-        with httpx.Client(base_url=found.group(), timeout=500.0, limits=limits) as client:
+        with httpx.Client(base_url=found.group(), timeout=500.0, limits=httpx.Limits(max_keepalive_connections=0)) as client:
             yield client, process
     finally:
         process.send_signal(signal.SIGKILL)

@@ -44,8 +44,7 @@ def random_arrays(robot: Robot, n: int, rng: Generator, waypoints: int = WAYPOIN
     """Arrays of a shard: bent motions between random configurations, among spheres and boxes."""
     s = np.linspace(0, 1, waypoints)[:, None]
     ends = rng.uniform(0.6 * robot.lower, 0.6 * robot.upper, (2, n, 1, robot.dof))
-    bow = rng.uniform(-0.3, 0.3, (n, 1, robot.dof)) * np.sin(np.pi * s)
-    q = (ends[0] * (1 - s) + ends[1] * s + bow).astype(np.float32)
+    q = (ends[0] * (1 - s) + ends[1] * s + rng.uniform(-0.3, 0.3, (n, 1, robot.dof)) * np.sin(np.pi * s)).astype(np.float32)
     goals = np.full((n, GOALS, robot.dof), np.nan, np.float32)
     index = rng.integers(0, GOALS - 1, n)
     goals[:, : GOALS - 1] = rng.uniform(robot.lower, robot.upper, (n, GOALS - 1, robot.dof))

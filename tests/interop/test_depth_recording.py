@@ -70,8 +70,7 @@ def pose(parent: str, child: str, at: float, turn: float = 0.0, x: float = 0.0) 
 def camera(frame: str, at: float, encoding: str, unit: float, zeros: int = 0) -> tuple[Any, Any]:
     """CameraInfo and an image of two rows, in multiples of `unit` [m]."""
     size = {"header": {"stamp": stamp(at), "frame_id": frame}, "height": 2, "width": 2}
-    pixels = np.round(np.array([[0.5, 0.0], [1.5, 2.0]]) / unit).astype("<u2")
-    data = np.frombuffer(pixels.tobytes() + bytes(zeros), np.uint8)
+    data = np.frombuffer(np.round(np.array([[0.5, 0.0], [1.5, 2.0]]) / unit).astype("<u2").tobytes() + bytes(zeros), np.uint8)
     info = size | {"k": [300.0, 0.0, 0.5, 0.0, 310.0, 0.4, 0.0, 0.0, 1.0], "r": np.zeros(9), "p": np.zeros(12)}
     info |= {name.upper(): info[name] for name in "krp"}  # as ROS 1 has them
     return info, size | {"encoding": encoding, "step": 4, "data": data}

@@ -98,8 +98,7 @@ def test_mcap_holds_scene_urdf_frames_and_joint_states(planned: Planned, tmp_pat
     assert entities["ball"].spheres[0].size.x == 0.4 and entities["table"].frame_id == "panda_link0"
     assert {"capsule", "cylinder", "mesh"} <= entities.keys()
     assert any(name.startswith("panda_link5/") for name in entities)
-    placed = {frame.child_frame_id for frame in frames[0]} | {"panda_link0"}
-    assert {entity.frame_id for entity in entities.values()} <= placed
+    assert {entity.frame_id for entity in entities.values()} <= {frame.child_frame_id for frame in frames[0]} | {"panda_link0"}
     assert json.loads(attached["problem.json"])["start"] == START
     found = recorded_motion.motion_of_robot(read_motion(tmp_path / "m.mcap", "/joint_states"), PANDA)
     assert "panda_finger_joint1, panda_finger_joint2 stay at their locked values" in found.notes

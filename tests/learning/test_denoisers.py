@@ -164,8 +164,7 @@ def test_files(tmp_path, name, null_condition):
     assert type(loaded.denoiser) is denoisers.DENOISERS.load(name)
     scale = 2.0 if null_condition else 1.0
     np.testing.assert_array_equal(sample(loaded, scale), sample(model.requires_grad_(False).eval(), scale))
-    exported = exported_model("model", tmp_path, box_arm())
-    np.testing.assert_allclose(sample(exported, scale), sample(loaded, scale), atol=1e-4)
+    np.testing.assert_allclose(sample(exported_model("model", tmp_path, box_arm()), scale), sample(loaded, scale), atol=1e-4)
 
 
 @pytest.mark.parametrize("name", denoisers.DENOISERS)

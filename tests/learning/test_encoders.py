@@ -232,8 +232,7 @@ def data(tmp_path, monkeypatch):
 
 def planner(data, encoder, **changes) -> PlannerTraining:
     sizes: dict[str, Any] = {"samples": 96, "batch": 16, "warmup_steps": 1, "validation_problems": 1}
-    planned = PlannerTraining(data=str(data), encoder=encoder, minutes=None, **sizes, **denoiser_for(encoder))
-    return replace(planned, **changes)
+    return replace(PlannerTraining(data=str(data), encoder=encoder, minutes=None, **sizes, **denoiser_for(encoder)), **changes)
 
 
 @pytest.mark.slow

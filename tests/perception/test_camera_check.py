@@ -66,8 +66,7 @@ def test_a_wrong_camera_gives_little_confidence() -> None:
         ({"T_base_camera": np.linalg.inv(T)}, "is the inverse, T_camera_base"),
     )
     for wrong, message in wrong_ones:
-        views = [replace(at_home(), **wrong)]
-        problem = rd.Problem(PANDA, rd.Scene(), HOME, HOME + 0.3, views=views, unknown="optimistic")
+        problem = rd.Problem(PANDA, rd.Scene(), HOME, HOME + 0.3, views=[replace(at_home(), **wrong)], unknown="optimistic")
         result = rd.load_planner("aorrtc").plan(problem, until="first")
         assert result.confidence is not None and result.confidence <= 0.5, message
         assert any(re.search(f"^check the camera of views.0.: .*{message}", note) for note in result.notes), message

@@ -47,8 +47,7 @@ def test_points_lie_on_surfaces_and_nothing_is_nearer(seed: int) -> None:
 
 def test_the_arm_is_its_covering_spheres() -> None:
     q = np.array([0.3, -0.5, 0.0, -2.0, 0.0, 1.5, 0.8])
-    T = looking_at(np.array([1.5, 0.5, 0.6]), np.array([0.0, 0.0, 0.4]))
-    view = ray_cast(rd.Scene(), T, INTRINSICS, SIZE, PANDA, q)
+    view = ray_cast(rd.Scene(), looking_at(np.array([1.5, 0.5, 0.6]), np.array([0.0, 0.0, 0.4])), INTRINSICS, SIZE, PANDA, q)
     spheres = PANDA.placed_spheres(q)
     gaps = np.linalg.norm(view.points()[:, None] - spheres[:, :3], axis=-1) - spheres[:, 3]
     assert len(gaps) > 100 and np.abs(gaps.min(axis=1)).max() < 2e-5

@@ -19,8 +19,7 @@ BLOCKED = Scene([Sphere((0.4, 0.3, 0.6), 0.15)])
 
 
 def context_for(scene: Scene, time_limit: float = 10.0) -> PlanningContext:
-    problem = Problem(load_robot("panda"), scene, HOME, turned(1.2))
-    return PlanningContext("test", problem, PlanRequest(time_limit=time_limit))
+    return PlanningContext("test", Problem(load_robot("panda"), scene, HOME, turned(1.2)), PlanRequest(time_limit=time_limit))
 
 
 def test_progress_falls_and_ends_with_the_returned_path_when_it_was_found() -> None:

@@ -70,8 +70,7 @@ def test_an_image_that_sees_through_the_arm_is_refused() -> None:
 def test_a_view_of_another_thread_waits_for_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
     arm = explorer(goal=RIGHT)
     before = arm.map.unknown
-    view = simulated.camera_beside(replace(PROBLEM, scene=rd.Scene([FLOOR])), None, 0)
-    observer = Thread(target=arm.observe, args=(view,))
+    observer = Thread(target=arm.observe, args=(simulated.camera_beside(replace(PROBLEM, scene=rd.Scene([FLOOR])), None, 0),))
     during = list[np.ndarray]()
 
     def at_goal(*_: object) -> None:

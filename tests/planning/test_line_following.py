@@ -106,8 +106,7 @@ def test_lines_out_of_reach_or_into_a_box_end_there() -> None:
     assert not result.solved and "from the start the line can be followed for" in result.reason
     assert result.fraction is not None and 0.1 < result.fraction < 0.9
     assert len(PANDA.ik(moved([0.6 * result.fraction, 0, 0]), link=HAND, near=START))
-    table = rd.Box([0.5, 0.05, 0.05], [0.3, 0.3, 0.1], name="table")
-    result = planned(moved([0, 0, -0.3]), rd.Scene([table]), time_limit=0.3)
+    result = planned(moved([0, 0, -0.3]), rd.Scene([rd.Box([0.5, 0.05, 0.05], [0.3, 0.3, 0.1], name="table")]), time_limit=0.3)
     assert not result.solved and "table" in result.reason
     # fingertips are 0.112 m below the hand's origin; the table's top is at 0.1 m
     gap = T_START[2, 3] - 0.112 - 0.1

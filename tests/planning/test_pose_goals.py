@@ -301,8 +301,7 @@ def test_the_goal_index_names_the_goal_that_is_reached() -> None:
         assert rd.plan(rd.Problem(PANDA, FREE, start, goal)).goal_index == index
     # poses 2 mm apart: both are within the validator's centimeter
     T = PANDA.fk(near)
-    T_beside = transform(T[:3, 3] + [0.002, 0, 0], T[:3, :3])
-    goals = rd.AnyGoal((rd.PoseGoal(PANDA.tip, T_beside), rd.PoseGoal(PANDA.tip, T)))
+    goals = rd.AnyGoal((rd.PoseGoal(PANDA.tip, transform(T[:3, 3] + [0.002, 0, 0], T[:3, :3])), rd.PoseGoal(PANDA.tip, T)))
     result = rd.plan(rd.Problem(PANDA, FREE, start, goals))
     assert result.goal_index is not None
     reached = goals.goals[result.goal_index]

@@ -149,8 +149,7 @@ def test_bad_input() -> None:
 def test_values_by_joint_are_a_configuration() -> None:
     space = panda()
     by_joint = dict(zip(space.robot.joint_names, GOAL.tolist(), strict=True))
-    problem = rd.Problem(space.robot, space.scene, by_joint | {"panda_finger_joint1": 0.01}, "ready")
-    assert np.array_equal(problem.start, GOAL)
+    assert np.array_equal(rd.Problem(space.robot, space.scene, by_joint | {"panda_finger_joint1": 0.01}, "ready").start, GOAL)
     several = rd.Problem(space.robot, space.scene, "ready", [by_joint, "extended"])
     assert np.array_equal(several.goal.positions[0], GOAL)  # type: ignore[union-attr]
     assert np.array_equal(space.pose(by_joint), space.pose(GOAL))

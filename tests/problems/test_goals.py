@@ -197,8 +197,7 @@ def test_poses_are_drawn_on_as_long_as_none_is_free() -> None:
     """The goal is a line of 10 m, of which 3 % can be reached and are free, so 20 draws usually miss that part."""
     block = rd.Box([0.65, 0.325, 0.5], [0.7, 1.35, 1.0], name="block")
     narrow = rd.PoseGoal("panda_hand", AHEAD, [0.0, 5.0, 0.0], [0.0, 0.0, np.pi])
-    problem = rd.Problem(ROBOT, rd.Scene([block]), [-1.5, 0.2, 0, -2.0, 0, 2.2, 0.2], narrow)
-    result = rd.plan(problem, time_limit=60.0, seed=5)
+    result = rd.plan(rd.Problem(ROBOT, rd.Scene([block]), [-1.5, 0.2, 0, -2.0, 0, 2.2, 0.2], narrow), time_limit=60.0, seed=5)
     assert result.path is not None, result.reason
     assert ROBOT.fk(result.path.positions[-1], "panda_hand")[1, 3] < -0.35
 

@@ -95,8 +95,7 @@ def test_what_cannot_be_held_is_told() -> None:
         (LOW, FAR, rd.Status.INVALID_START, "start"),
         ([0.0, -1.5, 0.0, -2.9, 0.0, 1.6, 0.0], FAR, rd.Status.INVALID_GOAL, "goal"),
     ):
-        problem = rd.Problem(PANDA, rd.Scene(), start, goal, payload=rd.Payload(6.0, [0.0, 0.0, 0.1]))
-        result = rd.plan(problem, time_limit=5.0)
+        result = rd.plan(rd.Problem(PANDA, rd.Scene(), start, goal, payload=rd.Payload(6.0, [0.0, 0.0, 0.1])), time_limit=5.0)
         assert result.status is status
         assert result.reason.startswith(f"the payload cannot be held at the {where}: panda_joint6 needs 1")
 

@@ -179,8 +179,7 @@ def test_both_arms_reach_as_far_as_one() -> None:
     both, left, right = (rd.load_robot(f"baxter{arm}") for arm in ("", "_left", "_right"))
     assert both.reach == pytest.approx(max(left.reach, right.reach), rel=0.01)  # of random configurations
     assert reach_bound(both) <= max(reach_bound(left), reach_bound(right)) + 1e-9
-    held = both.with_locked({n: 0.0 for n in both.joint_names if n[0] == "r"})
-    assert held.reach == pytest.approx(left.reach, rel=0.01)
+    assert both.with_locked({n: 0.0 for n in both.joint_names if n[0] == "r"}).reach == pytest.approx(left.reach, rel=0.01)
     for robot in (both, left):
         q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (50, robot.dof))
         spheres = np.concatenate([robot.placed_spheres(one) for one in q])

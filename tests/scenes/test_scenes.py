@@ -41,8 +41,7 @@ def surface_distance(shape: Shape, points: ndarray) -> ndarray:
     if isinstance(shape, rd.PointCloud):
         return np.abs(points[:, None] - shape.points).max(axis=2).min(axis=1)
     if isinstance(shape, rd.Mesh):
-        triangles = shape.world_vertices[shape.faces]
-        gaps = [points - closest_point(np.repeat(t[None], len(points), 0), points) for t in triangles]
+        gaps = [points - closest_point(np.repeat(t[None], len(points), 0), points) for t in shape.world_vertices[shape.faces]]
         return np.linalg.norm(gaps, axis=2).min(axis=0)
     return np.abs(distance(shape, points))
 

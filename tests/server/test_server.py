@@ -297,8 +297,7 @@ def test_a_full_queue_says_when_to_try_again(server: httpx.Client) -> None:
     with ThreadPoolExecutor(3) as threads:
         jobs = []
         for i in range(3):
-            named = {"X-Request-ID": f"{i}"}
-            jobs.append(threads.submit(server.post, "/plan", json=asked(SEARCHES, "faulty"), headers=named))
+            jobs.append(threads.submit(server.post, "/plan", json=asked(SEARCHES, "faulty"), headers={"X-Request-ID": f"{i}"}))
         until(lambda: gauge(server, "workers_busy") + gauge(server, "requests_waiting") == 3)
         full = server.post("/plan", json=asked())
         batch = server.post("/batch", content=json.dumps(asked()), headers=LINES)

@@ -31,8 +31,7 @@ PANDA_START = np.array([-0.6, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 
 
 def motion(robot: rd.Robot, *waypoints: np.ndarray) -> rd.Trajectory:
-    path = rd.Path(robot.joint_names, np.stack(waypoints))
-    return time_parameterize(robot, path, lambda _: True, lambda _: True).trajectory
+    return time_parameterize(robot, rd.Path(robot.joint_names, np.stack(waypoints)), lambda _: True, lambda _: True).trajectory
 
 
 def test_a_motion_of_one_row_holds_still() -> None:
@@ -199,8 +198,7 @@ TOLERANCE = 7e-4
 
 def far_pairs_only(robot: rd.Robot) -> rd.Robot:
     """The robot with allowed contact between links that are at most two joints apart."""
-    pairs = combinations(robot.meshes, 2)
-    near = [frozenset(p) for p in pairs if abs(robot.link_frame(p[0]) - robot.link_frame(p[1])) <= 2]
+    near = [frozenset(p) for p in combinations(robot.meshes, 2) if abs(robot.link_frame(p[0]) - robot.link_frame(p[1])) <= 2]
     return replace(robot, allowed_collisions=frozenset(near))
 
 

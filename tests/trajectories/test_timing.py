@@ -445,8 +445,7 @@ FAR, NEAR = np.array([3.0, 1.0]), np.array([0.1, -0.05])
 
 def test_the_time_of_a_line_by_hand():
     one = np.ones(2)
-    goals = np.stack([FAR, NEAR, START])
-    assert np.allclose(straight_line_time(START, goals, one, one), [3.0 + 1.0, 2 * np.sqrt(0.1), 0.0])
+    assert np.allclose(straight_line_time(START, np.stack([FAR, NEAR, START]), one, one), [3.0 + 1.0, 2 * np.sqrt(0.1), 0.0])
     # the slowest joint at each limit decides: times 1 / v, 1 / a of the share of the way
     assert np.isclose(straight_line_time(START, FAR, np.array([6.0, 0.5]), np.array([3.0, 1.0])), 2.0 + 0.5)
     # the greatest jerk alone binds in short motions
@@ -485,7 +484,6 @@ def test_along_a_line_as_toppra_times_it():
             toppra.constraint.JointVelocityConstraint(np.stack([-v, v], axis=1)),
             toppra.constraint.JointAccelerationConstraint(np.stack([-a, a], axis=1)),
         ]
-        grid = np.linspace(0.0, 1.0, 1001)
-        by_toppra = toppra.algorithm.TOPPRA(limits, path, grid, parametrizer="ParametrizeConstAccel")
+        by_toppra = toppra.algorithm.TOPPRA(limits, path, np.linspace(0.0, 1.0, 1001), parametrizer="ParametrizeConstAccel")
         trajectory: Any = by_toppra.compute_trajectory(0, 0)
         assert straight_line_time(START, goal, v, a) == pytest.approx(trajectory.duration, rel=5e-3)

@@ -175,8 +175,7 @@ def problem_and_path(rows: np.ndarray) -> tuple[rd.Problem, rd.Path]:
 
 
 def test_limits_start_and_goal() -> None:
-    over = np.array([SWING[0], [0, 2.8 + 1e-3, 0], [0, 2.9, 0], SWING[1]])
-    found = refused(rd.verify(*problem_and_path(over)), "limits")
+    found = refused(rd.verify(*problem_and_path(np.array([SWING[0], [0, 2.8 + 1e-3, 0], [0, 2.9, 0], SWING[1]]))), "limits")
     assert (found.subject, found.time) == ("j1", 1.0) and found.excess == pytest.approx(1e-3)
     assert rd.verify(*problem_and_path(np.array([SWING[0], [0, 2.8 + 1e-7, 0.5], SWING[1]]))).valid
     assert refused(rd.verify(*problem_and_path(SWING + vector(1e-4, 0, 0))), "start").time == 0

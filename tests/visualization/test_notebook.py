@@ -46,8 +46,7 @@ def test_a_result_and_a_result_file_in_a_cell(result: rd.PlanResult, tmp_path: P
 
 @pytest.mark.usefixtures("notebook")
 def test_no_motion() -> None:
-    blocked = rd.Problem(PANDA, rd.Scene([rd.Sphere([0.4, 0, 0.4], 0.3)]), START, END)
-    cell = rd.show(rd.load_planner("aorrtc").plan(blocked))
+    cell = rd.show(rd.load_planner("aorrtc").plan(rd.Problem(PANDA, rd.Scene([rd.Sphere([0.4, 0, 0.4], 0.3)]), START, END)))
     assert "panda · invalid start" in cell._repr_html_() and "inside sphere" in cell._repr_html_()
 
 

@@ -103,8 +103,7 @@ def test_a_stop_at_a_waypoint_is_not_gone_through() -> None:
     found = rd.load_planner("rrt_connect").plan(task, 20.0)
     assert found.solved, found.reason
     assert rd.verify(task, found.trajectory).valid
-    alone = rd.load_planner("rrt_connect").plan(replace(task, moving=()), 20.0).trajectory
-    assert found.trajectory.duration > alone.duration
+    assert found.trajectory.duration > rd.load_planner("rrt_connect").plan(replace(task, moving=()), 20.0).trajectory.duration
 
 
 def test_corners_are_rounded_as_far_as_the_planner_certified() -> None:
@@ -139,8 +138,7 @@ def test_motions_begin_with_the_start_velocity(velocity: np.ndarray) -> None:
     assert found.solved, found.reason
     assert np.allclose(found.trajectory.velocities[0], velocity, atol=1e-9)
     assert not found.stops and not found.notes
-    states = found.trajectory.at(np.arange(0.0, found.trajectory.duration, 1e-4))
-    assert (np.abs(states.jerks) <= jerk_limits(PANDA)).all()
+    assert (np.abs(found.trajectory.at(np.arange(0.0, found.trajectory.duration, 1e-4)).jerks) <= jerk_limits(PANDA)).all()
     assert not found.trajectory.accelerations[0].any()
     assert rd.verify(task, found.trajectory).valid
     assert rd.verify(replace(task, start_velocity=None), found.trajectory).violation.kind in ("rest", "acceleration")

@@ -86,8 +86,7 @@ def test_the_unknown_region_is_found_for_the_chosen_motion_only(planner: Planner
     counted = Mock(wraps=heaviest_part)
     monkeypatch.setattr("robotdiffuse.perception.unknown_space.heaviest_part", counted)
     everywhere = np.full(FINE.shape, np.float32(0.01))
-    request = PlanRequest(20.0, until=FIRST)
-    result = unknown_space.plan_with_unknown_space(planner, partial("predicted"), request, everywhere)
+    result = unknown_space.plan_with_unknown_space(planner, partial("predicted"), PlanRequest(20.0, until=FIRST), everywhere)
     assert result.unknown_region is not None and counted.call_count == 1
 
 

@@ -62,8 +62,7 @@ def test_every_command_is_a_certified_stop(count: int, seed: int) -> None:
         if command.renewed:
             renewed += 1
             anywhere = [rd.MovingObstacle(rd.Sphere(place, 0.1), max_speed=SPEED) for place in seen]
-            validator = MovingCollision(PANDA, anywhere, 1e-4, 0.5)
-            assert validator.sweep(motion.times + PERIOD, motion.positions).contact is None
+            assert MovingCollision(PANDA, anywhere, 1e-4, 0.5).sweep(motion.times + PERIOD, motion.positions).contact is None
             ends = motion.positions[0], motion.positions[-1]
             still = rd.Problem(PANDA, rd.Scene([FLOOR]), *ends, start_velocity=motion.velocities[0])
             violation = rd.verify(still, motion).violation

@@ -57,8 +57,7 @@ def grid_optimum(checker: CollisionChecker, start: np.ndarray, goal: np.ndarray,
 
 def test_rrt_star_alone_converges_to_the_optimum() -> None:
     """Choose-parent and rewiring, without RRT-Connect and shortcuts, as asymptotic optimality requires."""
-    scene = rd.Scene([rd.Sphere([0.75, 0.0, 0.0], 0.2), rd.Sphere([-0.3, 0.7, 0.0], 0.15)])
-    checker = CollisionChecker(two_joints(), scene)
+    checker = CollisionChecker(two_joints(), rd.Scene([rd.Sphere([0.75, 0.0, 0.0], 0.2), rd.Sphere([-0.3, 0.7, 0.0], 0.15)]))
     axis = np.linspace(-2.8, 2.8, 281)
     start, goal = (np.array([axis[np.abs(axis - x).argmin()] for x in q]) for q in ((-0.9, 0.3), (0.9, -0.5)))
     assert checker.free(np.stack([start, goal])).all()

@@ -75,8 +75,7 @@ def test_distances_are_the_same_in_the_world() -> None:
     here = ExactCollision(robot, scene).link_distances(q)
     for there in (ExactCollision(robot, problem.scene), ExactCollision(standing, world)):
         assert np.allclose([d.distance for d in here], [d.distance for d in there.link_distances(q)], atol=1e-6)
-    T = inverse(standing.fk(q, "panda_hand")) @ T_WORLD_BASE @ robot.fk(q, "panda_hand")
-    assert np.allclose(T, np.eye(4), atol=1e-12)
+    assert np.allclose(inverse(standing.fk(q, "panda_hand")) @ T_WORLD_BASE @ robot.fk(q, "panda_hand"), np.eye(4), atol=1e-12)
 
 
 def test_files_in_the_world_come_back_as_they_were_read(tmp_path: Path) -> None:

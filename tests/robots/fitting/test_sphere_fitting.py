@@ -81,8 +81,7 @@ def test_what_neighbors_hide_wholly_is_covered_too() -> None:
 def test_tight_places_are_kept_free() -> None:
     solid = Solid.of(SHAPES["box"], TOLERANCE)
     side = np.array([[0.05, 0.0, 0.0]])
-    bounds = Bounds(TOLERANCE, tight=np.column_stack([side, [0.002]]))
-    spheres = fit_spheres(solid, bounds, np.random.default_rng(0), QUICK)
+    spheres = fit_spheres(solid, Bounds(TOLERANCE, tight=np.column_stack([side, [0.002]])), np.random.default_rng(0), QUICK)
     assert covered(SHAPES["box"], spheres)
     about = np.array([0.05, 0, 0]) + np.random.default_rng(1).uniform(-0.01, 0.01, (5000, 3))
     assert about[gaps(about, spheres) < 0, 0].max() < 0.05 + 0.002 + 0.6 * solid.spacing
@@ -93,8 +92,7 @@ def test_nothing_reaches_below_the_floor() -> None:
     solid = Solid.of(meshes, TOLERANCE)
     free = fit_spheres(solid, Bounds(TOLERANCE), np.random.default_rng(0), QUICK)
     assert (free[:, 2] - free[:, 3]).min() < -0.003
-    bounds = Bounds(TOLERANCE, floor=(np.array([0, 0, 1.0]), 0.0))
-    spheres = fit_spheres(solid, bounds, np.random.default_rng(0), QUICK)
+    spheres = fit_spheres(solid, Bounds(TOLERANCE, floor=(np.array([0, 0, 1.0]), 0.0)), np.random.default_rng(0), QUICK)
     assert covered(meshes, spheres) and (spheres[:, 2] - spheres[:, 3]).min() > -1e-3
 
 

@@ -43,8 +43,7 @@ END = {
 def test_grippers_and_hands_are_known_and_held(parts: str, tip: str, tmp_path: Path) -> None:
     robot = read_urdf(written(tmp_path, ARM, parts))
     assert robot.tip == tip and robot.joint_names == tuple(row("j", 6))
-    held = {j.name for j in robot.joints if j.kind != "fixed"} - {*robot.joint_names}
-    assert robot.locked.keys() == held
+    assert robot.locked.keys() == {j.name for j in robot.joints if j.kind != "fixed"} - {*robot.joint_names}
 
 
 def test_a_joint_called_gripper_is_planned_if_the_tip_says_so(tmp_path: Path) -> None:
@@ -144,8 +143,7 @@ def test_mimics_of_planned_joints_raise_unless_they_are_locked(tmp_path: Path) -
 @pytest.mark.parametrize("followed", ["nobody", "rod", "other"])
 def test_mimic_of_nothing_or_in_a_circle(followed: str, tmp_path: Path) -> None:
     rod = joint("rod", "base", "bar", more=f'<mimic joint="{followed}"/>')
-    other = joint("other", "base", "end", more='<mimic joint="rod"/>')
-    file = written(tmp_path, ARM, link("bar"), rod, link("end"), other)
+    file = written(tmp_path, ARM, link("bar"), rod, link("end"), joint("other", "base", "end", more='<mimic joint="rod"/>'))
     refuses("another joint of the file and must not mimic", read_urdf, file)
 
 

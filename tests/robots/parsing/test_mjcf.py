@@ -156,8 +156,7 @@ def test_obstacles_that_are_no_solids_are_refused() -> None:
 
 def test_obstacles_without_names_have_numbers() -> None:
     """Regression: scenes of Meta-World were refused, since a box has no name."""
-    model = mujoco.MjModel.from_xml_string(BODY.format(""))
-    assert [shape.name for shape in rd.Scene.from_mujoco(model).shapes] == ["geom0"]
+    assert [shape.name for shape in rd.Scene.from_mujoco(mujoco.MjModel.from_xml_string(BODY.format(""))).shapes] == ["geom0"]
 
 
 HILLY = f"""<mujoco>{FIELD}<worldbody><body name="b">

@@ -358,8 +358,7 @@ def test_meshes_by_package_relative_and_scaled(tmp_path: Path) -> None:
     (package / "urdf").mkdir()
     trimesh.creation.annulus(0.02, 0.03, 0.1).export(package / "meshes" / "ring.stl")
     for name in ("package://my_arm/meshes/ring.stl", "../meshes/ring.stl"):
-        shape = f'<mesh filename="{name}" scale="2 2 1"/>'
-        [ring] = surfaces(package / "urdf" / "arm.urdf", shape, '<origin xyz="0 0 1"/>')
+        [ring] = surfaces(package / "urdf" / "arm.urdf", f'<mesh filename="{name}" scale="2 2 1"/>', '<origin xyz="0 0 1"/>')
         assert np.linalg.norm(ring.vertices[:, :2], axis=1).max() == pytest.approx(0.06)
         np.testing.assert_allclose(ring.vertices[:, 2].mean(), 1.0, atol=1e-6)
 

@@ -374,8 +374,7 @@ def test_scaling_factors_padding_and_the_velocity_of_a_start_state_are_noted() -
         "start_state.joint_state.velocity [0.0, 0.3] is ignored: the motion begins at rest",
     }
     padded = [{"link_name": "panda_hand", "padding": 0.02}, {"link_name": "b", "padding": 0.0}]
-    notes = moveit.scene_robot_notes({"link_padding": padded}, PANDA)
-    assert notes == ("the scene's link_padding of panda_hand is ignored",)
+    assert moveit.scene_robot_notes({"link_padding": padded}, PANDA) == ("the scene's link_padding of panda_hand is ignored",)
 
 
 def test_wrong_requests() -> None:
