@@ -116,6 +116,7 @@ FOUND = {
     "TIAGo": Urdf(f"{EXAMPLE}/tiago_description/robots/tiago.urdf"),
     "Stretch": Urdf(f"{ROBOPLAN}/stretch4_robot_model/stretch4_sg4.urdf"),
     "PR2": Urdf(f"{EXAMPLE}/pr2_description/urdf/pr2.urdf"),
+    "PR2, right": Urdf(f"{EXAMPLE}/pr2_description/urdf/pr2.urdf", "right_arm"),
     "Talos' left arm": Urdf(f"{EXAMPLE}/talos_data/robots/talos_left_arm.urdf"),
     "G1": Urdf(f"{EXAMPLE}/g1_description/urdf/g1_29dof_rev_1_0.urdf"),
     "iCub": Urdf(f"{EXAMPLE}/icub_description/robots/icub.urdf"),

@@ -1,6 +1,7 @@
 """Runs the whole package under jaxtyping and beartype: a wrong shape annotation fails the suite."""
 
 import ast
+import gc
 import os
 import re
 import threading
@@ -65,6 +66,11 @@ jaxtyping.install_import_hook(checked_modules(), "beartype.beartype")
 # the same examples at every run: a suite that fails by chance guards nothing
 settings.register_profile("suite", deadline=None, max_examples=40, derandomize=True)
 settings.load_profile("suite")
+
+
+def pytest_collection_finish() -> None:
+    """What is imported stays, so the garbage collector need not look at it again and again."""
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True, scope="session")
