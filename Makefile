@@ -2,7 +2,7 @@
 # make weights   makes training data and trains the weights anew, in runs/panda; the same command resumes
 # make baselines trains the learned baselines on the same data, in runs/panda
 # make install   the development environment with all extras in .venv
-# make test      the quick tests: less than five minutes on two idle cores; the first run compiles too, for about as long
+# make test      the quick tests: about five minutes on two idle cores; the first run compiles too, for about as long
 # make test-all  all tests, those marked slow, browser, sim and cluster too
 # make lint      ruff and pyright
 # make bench     all benchmarks
@@ -54,7 +54,7 @@ compiled: .venv/dev.stamp
 	set -e; work=$$(mktemp -d); here=$$PWD; cd $$work; $$here/$(BIN)/robotdiffuse demo >/dev/null; \
 		$$here/$(BIN)/robotdiffuse plan $$here/examples/upright_cup.yaml --planner aorrtc >/dev/null; rm -r $$work
 
-test-all: .venv/dev.stamp chromium
+test-all: .venv/dev.stamp chromium compiled
 	$(BIN)/python -m pytest -n 3 --dist worksteal
 
 # alone, one thread takes three quarters of the work of two, so .ci/run, which tests meanwhile, uses one

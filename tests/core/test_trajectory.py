@@ -14,7 +14,7 @@ def cubic(steps: int = 7) -> Trajectory:
     t = np.linspace(0.0, 1.0, steps) ** 1.3 * 2.0
     u = (t / 2.0)[:, None]
     far = np.array([[1.0, -0.5, 0.2]])
-    return Trajectory(("a", "b", "c"), t, *(u**2 * (3 - 2 * u) * far, 3 * u * (1 - u) * far, (1.5 - 3 * u) * far))
+    return Trajectory(("a", "b", "c"), t, u**2 * (3 - 2 * u) * far, 3 * u * (1 - u) * far, (1.5 - 3 * u) * far)
 
 
 def smooth(legs: int = 1, rate: float = 40.0) -> Trajectory:
