@@ -98,6 +98,18 @@ def test_intrinsics_of_another_image_and_a_calibration_that_is_off_are_named() -
     assert "sees through" in camera_note(replace(at_home(), T_base_camera=off), PANDA, HOME)
 
 
+@pytest.mark.parametrize("x", [0.52, 0.55])
+def test_a_table_at_the_height_of_the_base_is_not_taken_for_the_arm(x: float) -> None:
+    """Regression: of a camera above a table that did not see the arm, a note said that its intrinsics were those of a
+    wider image: seen so, the table at the arm's base has the base's depth."""
+    above = looking_at(np.array([x + 0.05, 0.02, 0.68]), np.array([x - 0.05, 0.0, 0.0]))
+    table = rd.Scene([rd.Box((0.5, 0, -0.07), (4, 4, 0.1)), rd.Box((x + 0.1, 0.1, 0.0), (0.1, 0.1, 0.1))])
+    turned = HOME + np.array([2.8, 0, 0, 0, 0, 0, 0])
+    view = ray_cast(table, above, (525.0, 525.0, 319.5, 239.5), (640, 480))
+    assert agreement(view, PANDA, turned)[2] == 0, "the arm is not in the image"
+    assert camera_note(view, PANDA, turned) == ""
+
+
 def test_the_pose_is_estimated_from_views_of_the_arm() -> None:
     configurations = [HOME + turn for turn in ([0.0] * 7, [0.5, 0.2, 0, 0.4, 0, 0, 0], [-0.6, 0.4, 0, 0.5, 0, 0, 0])]
     off = T.copy()

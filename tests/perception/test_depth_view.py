@@ -160,6 +160,20 @@ def test_intrinsics_beside_an_image(name: str, content: Any, tmp_path: Path) -> 
     assert view.intrinsics == K
 
 
+@pytest.mark.parametrize(
+    "stated", [{"width": 16, "height": 12}, {"width": 6, "height": 8}, {"image_width": 16, "image_height": 12}]
+)
+def test_intrinsics_in_a_file_for_images_of_another_size(stated: dict[str, int], tmp_path: Path) -> None:
+    """Regression: the size in the file was ignored, and resized and transposed images were taken as they were."""
+    Image.fromarray(np.full((6, 8), 1500, np.uint16)).save(tmp_path / "a.png")
+    content = {"fx": K[0], "fy": K[1], "cx": K[2], "cy": K[3]}
+    entry = {"depth": "a.png", "intrinsics": "camera.json", "camera": CAMERA}
+    (tmp_path / "camera.json").write_text(json.dumps(content | stated))
+    refuses(r"camera.json is for images of .* pixels, h x w; this one has \(6, 8\)", read_views, [entry], tmp_path)
+    (tmp_path / "camera.json").write_text(json.dumps(content | {"width": 8, "height": 6}))
+    assert read_views([entry], tmp_path)[0][0].intrinsics == K
+
+
 def test_what_is_wrong_in_a_file(tmp_path: Path) -> None:
     for name in "abc":
         Image.fromarray(np.full((6, 8), 1500, np.uint16)).save(tmp_path / f"{name}.png")

@@ -35,6 +35,11 @@ MIN_NAMED = 0.4
 fraction is below MIN_AGREEMENT, since objects in front of the arm may hide it."""
 BETTER = 1.5
 """A mistake is named only if undoing it raises the agreement by at least this factor."""
+STANDS_OUT = 0.2
+"""A mistake is named only if undoing it gives this much larger a fraction of the arm's cells the arm's depth
+than if the arm's image is also moved to any side: a table may have the depth of the arm, but everywhere."""
+SHIFTS = ((0, 12), (0, -12), (12, 0), (-12, 0))
+"""These movements, down and to the right [cells]."""
 MIN_THROUGH = 0.35
 """An image that sees through at least this fraction of the arm gets a note even if no mistake explains it."""
 OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -43,17 +48,21 @@ FOCAL_FACTORS = (0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0)
 """Factors for the focal length that are tried, in case the image was resized after the calibration."""
 
 
-def agreement(view: DepthView, robot: Robot, q: Configuration) -> tuple[float, float, int]:
+def agreement(
+    view: DepthView, robot: Robot, q: Configuration, shift: tuple[int, int] = (0, 0)
+) -> tuple[float, float, int]:
     """Compares an image with the arm's model at a configuration.
 
     Returns, for the image cells in which the model shows the arm: the fraction whose depth is the arm's, the
-    fraction that sees through the arm (larger depths), and the number of these cells.
+    fraction that sees through the arm (larger depths), and the number of these cells. shift: by how many
+    cells the model's image is moved down and to the right.
     """
     step = min(max(1, round(STEP_ANGLE * view.intrinsics[0])), *view.depth.shape)
     cells = view.depth[step // 2 :: step, step // 2 :: step]
     fx, fy, cx, cy = view.intrinsics
     coarse = (fx / step, fy / step, (cx - step // 2) / step, (cy - step // 2) / step)
     arm = ray_cast(NOTHING, view.T_base_camera, coarse, cells.shape[::-1], robot, q).depth
+    arm = np.roll(arm, shift, (0, 1))
     compared = np.isfinite(arm) & (cells > 0)
     behind = cells[compared] - arm[compared] - SPHERES_AHEAD
     if not len(behind):
@@ -129,7 +138,9 @@ def _camera_note(view: DepthView, robot: Robot, joint_values: tuple[float, ...])
     highest = max(MIN_NAMED, BETTER * agreed if count >= MIN_CELLS else 0.0)
     for name, other in mistakes(view):
         agrees, _, other_count = agreement(other, robot, q)
-        if other_count >= MIN_CELLS and agrees > highest:
+        if other_count < MIN_CELLS or agrees <= highest:
+            continue
+        if max(agreement(other, robot, q, shift)[0] for shift in SHIFTS) < agrees - STANDS_OUT:
             best = name
             highest = agrees
     if best or count < MIN_CELLS or through < MIN_THROUGH:

@@ -20,6 +20,7 @@ from robotdiffuse.core.errors import (
     MAX_RATE,
     InputError,
     check_type,
+    form,
     numbers,
     positive,
     rigid_transform,
@@ -87,8 +88,7 @@ class DepthView(Value):
     def __post_init__(self) -> None:
         depth = numbers(self.depth)
         if depth is None or depth.ndim != 2 or depth.size == 0:
-            form = "not numbers" if depth is None else f"an array of {' x '.join(map(str, depth.shape))}"
-            raise InputError(f"view.depth is {form}; it must be an image of height x width")
+            raise InputError(f"view.depth is {form(depth)}; it must be an image of height x width")
         intrinsics = vector("view", "intrinsics", _four_intrinsics(self.intrinsics), 4, MAX_RATE)
         if min(intrinsics[:2]) < MIN_FOCAL_LENGTH:
             requirement = f"fx and fy must be at least {MIN_FOCAL_LENGTH:g} [pixels]"

@@ -107,12 +107,12 @@ def _read_exr(file: Path) -> ndarray:
     return np.asarray((depths or [*channels.values()])[0].pixels)
 
 
-def read_intrinsics(file: Path) -> Any:
-    """The intrinsics of a camera, in a form that DepthView accepts.
+def read_intrinsics(file: Path, size: tuple[int, ...]) -> Any:
+    """The intrinsics of a camera, in a form that DepthView accepts. size: height and width of its image.
 
     A .npy or .txt file holds the camera matrix or fx, fy, cx, cy as numbers. A .json or .yaml file holds a
     camera_info of ROS, intrinsics written by librealsense or Open3D, or fx, fy, cx and cy by name. Raises
-    InputError for a file without intrinsics.
+    InputError for a file without intrinsics, and for one that states another size of the image.
     """
     input_file(file, "file of intrinsics")
     if file.suffix.lower() == ".npy":
@@ -122,6 +122,9 @@ def read_intrinsics(file: Path) -> Any:
             return np.loadtxt(file, max_rows=4)
     record = read_json(file) if file.suffix.lower() == ".json" else read_yaml(file)
     if isinstance(record, dict):
+        stated = tuple(record.get(name, record.get(f"image_{name}")) for name in ("height", "width"))
+        if all(stated) and stated != size:
+            raise InputError(f"{file} is for images of {shown(stated)} pixels, h x w; this one has {size}")
         for name in ("K", "k", "cam_K", "camera_matrix", "intrinsic_matrix"):
             if name in record:
                 rows = record[name]["data"] if isinstance(record[name], dict) else record[name]
@@ -207,7 +210,7 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
         files = ", ".join(INTRINSICS_FORMATS)
         raise InputError(f"{where} has no intrinsics, nor a file of them with the image's name ({files})")
     if isinstance(intrinsics, str):
-        intrinsics = read_intrinsics(folder / intrinsics)
+        intrinsics = read_intrinsics(folder / intrinsics, getattr(numbers(image), "shape", ()))
     return DepthView(image, intrinsics, T_base_camera, configuration, source=source, **optional_fields)
 
 

@@ -1,12 +1,11 @@
 """Notes on problems whose numbers look like millimeters."""
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import reach_bound
-from robotdiffuse.core.types import Configuration, Points, Vector
+from robotdiffuse.core.types import Configuration, Vector
 from robotdiffuse.perception.depth_view import AssumedPoints, DepthView, SeenPoints
+from robotdiffuse.perception.seen_points import sphere_distances
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -59,8 +58,8 @@ def unit_notes(problem: Problem) -> tuple[str, ...]:
 def arm_in_cloud_note(robot: Robot, scene: Scene, q: Configuration) -> str:
     """A note on the cloud with the most points inside the arm at a configuration; "" if no cloud has many."""
     clouds = [shape for shape in scene.shapes if type(shape) is PointCloud]
-    spheres = robot.placed_spheres(q)
-    counts = [_points_within(cloud.points, spheres) for cloud in clouds]
+    spheres = robot.placed_spheres(q).astype(np.float32)
+    counts = [int((sphere_distances(cloud.points, spheres) < 0).sum()) for cloud in clouds]
     if max(counts, default=0) < MIN_POINTS_IN_ARM:
         return ""
     densest = int(np.argmax(counts))
@@ -90,13 +89,3 @@ def _view_note(i: int, view: DepthView, reach: float) -> str:
         return ""
     depths_are = f"depths of views[{i}] begin at {nearest:.4g} m, and half of them exceed {middle:.4g} m"
     return f"check the units: the {depths_are}; {ADVICE}"
-
-
-def _points_within(points: Points, spheres: Float[ndarray, "m 4"]) -> int:
-    """Number of points within any sphere."""
-    low, high = ((spheres[:, :3] + sign * spheres[:, 3:]) for sign in (-1, 1))
-    points = points[((points >= low.min(axis=0)) & (points <= high.max(axis=0))).all(axis=1)]
-    within = np.zeros(len(points), np.bool_)
-    for sphere in spheres:
-        within |= ((points - sphere[:3]) ** 2).sum(axis=1) < sphere[3] ** 2
-    return int(within.sum())
