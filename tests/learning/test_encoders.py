@@ -17,6 +17,7 @@ from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning import encoders
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_network, save_network
 from robotdiffuse.learning.denoisers import CrossAttentionSettings, TransformerSettings
+from robotdiffuse.learning.encoders import networks
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
@@ -113,7 +114,7 @@ def test_gradients_reach_every_parameter(name):
     clouds = torch.cat([cloud(40, 6), torch.zeros(2, 40, 3)])
     clouds[5, 2:] = 0.0
     loss = encoder(clouds).square().sum() + encoder(0 * clouds[:, :1]).square().sum()
-    if isinstance(encoder, encoders.networks.Autoencoder):
+    if isinstance(encoder, networks.Autoencoder):
         loss = loss + encoder.loss(clouds, np.random.default_rng(0))[0]
     loss.backward()
     for parameter, p in encoder.named_parameters():
@@ -124,7 +125,7 @@ def test_gradients_reach_every_parameter(name):
 @every_encoder
 def test_files(name, tmp_path):
     encoder = small(name)
-    if isinstance(encoder, encoders.networks.Autoencoder):
+    if isinstance(encoder, networks.Autoencoder):
         with torch.no_grad():
             encoder.standardize(encoder.encode(cloud(40, 30)))
     save_network("encoder", encoder, tmp_path, {})
@@ -166,12 +167,12 @@ def test_arranged_clouds():
 def test_edge_convolution_is_the_maximum_over_edges():
     """Compares with the layer as in the paper, computed edge by edge."""
     torch.manual_seed(0)
-    layer = encoders.networks.EdgeConvolution(5, 7, 4)
-    few = encoders.networks.neighbors(torch.tensor([[[0.0], [1.0], [3.0], [1.1]]]), torch.arange(4)[None] < 3, 4)[0]
+    layer = networks.EdgeConvolution(5, 7, 4)
+    few = networks.neighbors(torch.tensor([[[0.0], [1.0], [3.0], [1.1]]]), torch.arange(4)[None] < 3, 4)[0]
     assert [set(row.tolist()) for row in few] == [{0, 1, 2}] * 3 + [{0, 1, 2, 3}]
     x = torch.randn(2, 12, 5)
     near = torch.ones(2, 12, dtype=torch.bool)
-    index = encoders.networks.neighbors(x, near, 4)
+    index = networks.neighbors(x, near, 4)
     for b in range(2):
         apart = torch.cdist(x[b], x[b])
         for i in range(12):
