@@ -45,9 +45,8 @@ chromium:
 		timeout 600 apt-get install -qq -y --no-install-recommends chromium; } >/dev/null 2>&1; } || \
 		echo "there is no chromium: the tests in a browser are skipped"
 
-# one process more than two cores, since some tests wait for a browser or another process
 test: .venv/dev.stamp
-	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
 
 # on a new machine, before the tests: each process of the tests would compile for itself what all of them call
 compiled: .venv/dev.stamp
@@ -55,7 +54,7 @@ compiled: .venv/dev.stamp
 		$$here/$(BIN)/robotdiffuse plan $$here/examples/upright_cup.yaml --planner aorrtc >/dev/null; rm -r $$work
 
 test-all: .venv/dev.stamp chromium compiled
-	$(BIN)/python -m pytest -n 3 --dist worksteal
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 # alone, one thread takes three quarters of the work of two, so .ci/run, which tests meanwhile, uses one
 THREADS := --threads 2

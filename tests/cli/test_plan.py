@@ -191,5 +191,5 @@ def test_explore_writes_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 def test_demo_explore_says_what_happened(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status = run("demo", "--explore")
     printed = capsys.readouterr().out
-    assert "look: " in printed and f"The arm is {'' if status == 0 else 'not '}at the goal: " in printed
+    assert "look: " in printed and f"The arm is {'' if status == 0 else 'not '}at the goal" in printed
     assert (tmp_path / "explore.png").is_file() and (tmp_path / "explore.html").is_file()

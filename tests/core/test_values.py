@@ -12,7 +12,7 @@ from numpy import ndarray
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.commands import python
-from robotdiffuse.core.types import Value, read_only
+from robotdiffuse.core.types import Value, no_type_check, read_only
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.problems.constraints import FrameConstraint
 from robotdiffuse.robots.bodies import AttachedBody, ConvexMesh, Surface
@@ -193,3 +193,17 @@ print(len(signatures) > 0, read_only)
 def test_nothing_is_compiled_for_read_only_arrays() -> None:
     """Otherwise a plan's kernels would be compiled twice. Apart, since tests call kernels with arrays of their own."""
     assert python(SIGNATURES).stdout == "True []\n"
+
+
+class Unreadable:
+    def __get__(self, *_: object) -> None:
+        raise AttributeError
+
+
+def test_a_class_is_marked_although_an_attribute_of_its_base_is_unreadable() -> None:
+    """Regression: `import roslibpy, robotdiffuse` was an AttributeError; Twisted adds such an attribute to ABC."""
+
+    class Child(type("Base", (), {"__provides__": Unreadable()})):
+        def method(self) -> None: ...
+
+    assert all(hasattr(marked, "__no_type_check__") for marked in (no_type_check(Child), Child.method))

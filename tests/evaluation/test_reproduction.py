@@ -86,7 +86,7 @@ def test_a_small_page_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert main(command) == 0 and main(command) == 0
     assert [len(records) for records in read_records(tmp_path).values()] == [6, 6]
     page = (tmp_path / "table1.md").read_text()
-    assert "Goal: a pose with ten configurations; 3 problems that are not trivial" in page
+    assert "Goal: a pose with ten configurations; 3 nontrivial problems" in page
     assert "Trivial problems, in which the straight line" in page
     assert "| nearest" in page and "14.218" in page
 

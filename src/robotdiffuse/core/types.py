@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from pathlib import Path as FilePath
-from types import NoneType
+from types import FunctionType, NoneType
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -133,6 +133,17 @@ OBJECTIVES = (LENGTH, TIME)
 
 
 T = TypeVar("T")
+
+
+def no_type_check(kind: type[T]) -> type[T]:
+    """Mark a class that checks its arguments itself, so that type checkers at run time leave it alone.
+
+    It replaces `typing.no_type_check`, which fails for subclasses of ABC once Twisted (roslibpy) is imported.
+    """
+    members = [getattr(member, "__func__", member) for member in vars(kind).values()]
+    for marked in (kind, *(member for member in members if isinstance(member, FunctionType))):
+        setattr(marked, "__no_type_check__", True)  # noqa: B010  (type checkers do not know the attribute)
+    return kind
 
 
 class Value:

@@ -7,7 +7,7 @@ scenes/shapes.py.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, no_type_check
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -30,7 +30,7 @@ from robotdiffuse.core.errors import (
 )
 from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import placed
-from robotdiffuse.core.types import Configuration, Points, Pose, Value
+from robotdiffuse.core.types import Configuration, Points, Pose, Value, no_type_check
 from robotdiffuse.scenes.shapes import PointCloud
 
 INTEGER_NO_RETURN = 65535

@@ -1,7 +1,7 @@
 """Bodies of links: convex meshes, surfaces, inertias, and bodies that are attached to links."""
 
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple, Protocol, no_type_check, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -9,7 +9,16 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.core.errors import MAX_COORDINATE, InputError, numbers, shown, within
-from robotdiffuse.core.types import GivenVector, Points, Pose, Rotation, Value, Vector, read_only
+from robotdiffuse.core.types import (
+    GivenVector,
+    Points,
+    Pose,
+    Rotation,
+    Value,
+    Vector,
+    no_type_check,
+    read_only,
+)
 
 TOOL = "tool"
 """Default name of a tool."""

@@ -5,7 +5,6 @@ As with shapes, the constructor checks its arguments itself; scenes/shapes.py ex
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -37,6 +36,7 @@ from robotdiffuse.core.types import (
     Values,
     VectorOrNone,
     check_increasing,
+    no_type_check,
     read_only,
 )
 from robotdiffuse.scenes.shapes import Shape

@@ -4,13 +4,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import replace as dataclass_replace
 from functools import cached_property
-from typing import Any, no_type_check
+from typing import Any
 
 import numpy as np
 
 from robotdiffuse.core.errors import InputError, check_name, counted, joined, shown, unknown_name
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation, transform
-from robotdiffuse.core.types import Configuration, Pose, Value
+from robotdiffuse.core.types import Configuration, Pose, Value, no_type_check
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, no_type_check
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -31,7 +31,17 @@ from robotdiffuse.core.errors import (
 )
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import placed, quaternion_from_rotation, rotation_from_quaternion, transform
-from robotdiffuse.core.types import GivenArray, GivenVector, Points, Pose, Rotation, Value, Values, read_only
+from robotdiffuse.core.types import (
+    GivenArray,
+    GivenVector,
+    Points,
+    Pose,
+    Rotation,
+    Value,
+    Values,
+    no_type_check,
+    read_only,
+)
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.scenes.point_cloud import POINT_RADIUS, default_radius, distinct, read_points, voxel_thin
 
