@@ -49,7 +49,7 @@ def test_each_moment_has_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         first = np.asarray(image)[:100, :240].astype(int)
     assert (first[..., 2] > first[..., 0] + 25).sum() > 50, "the wall was seen"
     for write, ending in ((exploration.write_exploration_picture, "html"), (exploration.write_exploration, "png")):
-        refuses("", write, explorer, problem.scene, tmp_path / f"explore.{ending}")
+        refuses(f"unknown ending '.{ending}'", write, explorer, problem.scene, tmp_path / f"explore.{ending}")
 
 
 @pytest.fixture(scope="module")
