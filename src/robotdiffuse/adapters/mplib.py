@@ -225,10 +225,13 @@ class Planner:
     def detach_object(self, name: str = HELD, also_remove: bool = True) -> bool:
         """Release the held object, without adding it to the obstacles (`also_remove` is ignored). Returns
         whether an object was held."""
-        present = any(body.name == name for body in self.robot.attached)
+        present = self._holds(name)
         if present:
             self.workspace.robot = self.robot.detach(name)
         return present
+
+    def _holds(self, name: str) -> bool:
+        return any(body.name == name for body in self.robot.attached)
 
     def IK(
         self,
@@ -333,16 +336,21 @@ class Planner:
     def check_for_self_collision(self, *state: Any, **options: Any) -> list[str]:
         """A list with the reason why a configuration is refused even if all obstacles are ignored; empty if
         it is free. The configuration is the last argument (MPlib 0.1: after the robot), `qpos` or `state`."""
-        start = self._state(state[:2], options)
+        start = self._state(state, options)
         return _reasons(Workspace(self.robot), start)
 
     def check_for_env_collision(self, *state: Any, **options: Any) -> list[str]:
         """A list with the reason why a configuration is refused among the obstacles; empty if it is free. See
         `check_for_self_collision`; MPlib 0.1's further arguments are ignored."""
-        return _reasons(self.workspace, self._state(state[:2], options))
+        return _reasons(self.workspace, self._state(state, options))
 
     def _state(self, arguments: Sequence[Any], options: dict[str, Any]) -> ndarray:
-        return self._start(options.get("qpos", options.get("state", [(), *arguments][-1])))
+        """The planned joints of the configuration among the arguments of a check."""
+        if "qpos" in options:
+            return self._start(options["qpos"])
+        if "state" in options:
+            return self._start(options["state"])
+        return self._start(arguments[:2][-1] if arguments else ())
 
     def _planned(
         self, failed: str, plan: Callable[..., PlanResult], qpos: ArrayLike, options: dict[str, Any]
@@ -437,13 +445,8 @@ class Planner:
         # the third argument of MPlib 0.1 is link_id
         link = art_name if isinstance(art_name, int | np.integer) else link_id
         check_name("link_id", link, self._links)
-        before = self.robot
-        self.detach_object()
-        try:
-            self.workspace.robot = self.robot.attach(shape, self._links[int(link)])
-        except InputError:
-            self.workspace.robot = before
-            raise
+        empty_handed = self.robot.detach(HELD) if self._holds(HELD) else self.robot
+        self.workspace.robot = empty_handed.attach(shape, self._links[int(link)])
 
 
 def _reasons(workspace: Workspace, q: ndarray) -> list[str]:

@@ -61,11 +61,8 @@ def _changes(arguments: Namespace, settings: Any) -> dict[str, Any]:
     """The settings that the command's options set. By default, there is one worker process for every two
     cores."""
     check_workers(arguments)
-    return (
-        {"workers": HALF_OF_CORES}
-        | chosen(arguments, settings.__dataclass_fields__)
-        | {"out": Path(arguments.out)}
-    )
+    options = chosen(arguments, settings.__dataclass_fields__)
+    return {"workers": HALF_OF_CORES} | options | {"out": Path(arguments.out)}
 
 
 def run_report(arguments: Namespace) -> None:

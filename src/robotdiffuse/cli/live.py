@@ -28,9 +28,8 @@ def run_live(arguments: Namespace) -> NoReturn:
 def show_live(arguments: Namespace, settings: ExplorerSettings) -> NoReturn:
     """Serve the page of an exploration until Ctrl-C."""
     port = free_port(arguments.host, arguments.port)
-    session = ExplorationSession(
-        load_problem(arguments.problem), settings, arguments.noise, arguments.seed, arguments.speed
-    )
+    problem = load_problem(arguments.problem)
+    session = ExplorationSession(problem, settings, arguments.noise, arguments.seed, arguments.speed)
     serve_until_stopped(ExplorationPage(session, PageServer(arguments.host, port)))
 
 

@@ -126,8 +126,8 @@ def _print_pairs(report: "AddReport") -> None:
     """Print how many pairs of links are checked, how many are allowed for each reason, and where this differs
     from the SRDF."""
     reasons = Counter(pair.reason for pair in report.pairs)
-    counted = ", ".join(f"{reason} {count}" for reason, count in sorted(reasons.items()))
-    show(Table.pairs("", [("pairs of links", counted)]))
+    counts = ", ".join(f"{reason} {count}" for reason, count in sorted(reasons.items()))
+    show(Table.pairs("", [("pairs of links", counts)]))
     if report.srdf is None:
         return
     columns = ("link", "link", "by sampling", Column("colliding", "%", ".1f", scale=100.0), "by the SRDF")

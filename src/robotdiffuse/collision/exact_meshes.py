@@ -220,9 +220,11 @@ class ExactCollision:
         """
         T_piece = self._place(piece, frames)
         result = coal.DistanceResult()
-        if isinstance(other, _Piece) or not other.surface:
-            T_other = self._place(other, frames) if isinstance(other, _Piece) else other.T
+        if isinstance(other, _Piece):
+            T_other = self._place(other, frames)
             return coal.distance(piece.geometry, T_piece, other.geometry, T_other, self._request, result)
+        if not other.surface:
+            return coal.distance(piece.geometry, T_piece, other.geometry, other.T, self._request, result)
         # For a penetrated surface, Coal's distance query is slow and returns the depth at an arbitrary
         # triangle, so the contacts are computed first.
         request = self._contacts if depth else self._first_contact

@@ -191,15 +191,12 @@ def run_ablation(
         _training(out / ENCODER / "encoder.json", "encoder_samples", settings.encoder_samples)
         digests = {}
         for _, training in pool.each(_train, [(settings, training) for training in trainings]):
-            digests[training.folder] = _training(
-                out / training.folder / "model.json", "samples", settings.samples
-            )["data"]
+            about = _training(out / training.folder / "model.json", "samples", settings.samples)
+            digests[training.folder] = about["data"]
             report(f"trained {training.folder}")
         if len(set(digests.values())) > 1:
-            raise InputError(
-                f"{out} holds networks of different data: {', '.join(map(' '.join, digests.items()))}; use "
-                "another folder"
-            )
+            digests_text = ", ".join(f"{name} {digest}" for name, digest in digests.items())
+            raise InputError(f"{out} holds networks of different data: {digests_text}; use another folder")
         cases = hard_cases(settings.family, settings.problems, out / "problems", report)
         todo = [
             (settings, row_training, guided, cases)
@@ -209,7 +206,7 @@ def run_ablation(
         for number, evaluation in pool.each(_evaluate, todo):
             _, row_training, guided, _ = todo[number]
             evaluations[row_training, guided] = evaluation
-            name = getattr(row_training, "folder", row_training)
+            name = row_training if isinstance(row_training, str) else row_training.folder
             text = f"evaluated {name} {'with' if guided else 'without'} guidance"
             report(f"{text}: {100 * evaluation.single.mean():.1f} % of samples")
     results = []
@@ -255,7 +252,7 @@ def _train(settings: AblationSettings, training: Training) -> Training:
     if not (out / "model.json").exists():
         options = {"data": settings.data, "samples": settings.samples, "seed": training.seed}
         if "encoder" not in CONFIGS[training.config].changes:
-            options["encoder"] = f"{settings.out}/{ENCODER}"
+            options["encoder"] = str(FilePath(settings.out) / ENCODER)
         train_planner(planner_training(training.config, options), str(out))
     return training
 
@@ -348,6 +345,7 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
         *(("each seed",) if several_seeds else ()),
         *("paper: suc", "col", "len", "s"),
     )
+    first = results[0].as_in_paper
     rows = []
     for result in results:
         evaluation = result.as_in_paper
@@ -360,7 +358,7 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
             float(evaluation.best.mean()),
             _share(evaluation.collided),
             Mean.of(evaluation.length).value,
-            Mean.of(evaluation.length / results[0].as_in_paper.length).value,
+            Mean.of(evaluation.length / first.length).value,
             float(np.median(evaluation.seconds)),
             _share(result.unguided.single),
             *((by_seed,) if several_seeds else ()),

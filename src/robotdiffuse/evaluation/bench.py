@@ -257,9 +257,10 @@ def on_this_machine(settings: "BenchSettings", runs: Sequence[Run], session: str
     the machine affects all of them alike.
     """
     first = {run.method: run for run in reversed(runs)}
+    specs = settings.specs
     workers = settings.workers
     planners = {
-        label: PlannerProcess(settings.specs[label], _log_file(settings.logs, label), settings.cpu_time)
+        label: PlannerProcess(specs[label], _log_file(settings.logs, label), settings.cpu_time)
         for label in first
     }
     pool = ThreadPoolExecutor(workers)
@@ -308,10 +309,8 @@ def on_cluster(settings: "BenchSettings", runs: Sequence[Run], session: str) -> 
 def records_of(run: Run, answers: Sequence[Fields], about: Fields) -> list[Record]:
     """The records of a run: one of the first call and, if there were restarts, one of all calls together."""
     labels = (run.method, run.method + RESTARTED)
-    return [
-        run.record({"planner": label, **about, **answer})
-        for label, answer in zip(labels, answers, strict=False)
-    ]
+    pairs = zip(labels, answers, strict=False)
+    return [run.record({"planner": label, **about, **answer}) for label, answer in pairs]
 
 
 def _log_file(logs: FilePath, label: str) -> FilePath:
@@ -414,9 +413,8 @@ def run_bench(settings: BenchSettings, report: Progress, done: Done) -> int:
         total = len(cases) * settings.seeds * len(specs)
         done(total - len(todo), total)
         make = on_this_machine if settings.cluster is None else on_cluster
-        return keep_records(
-            todo, make(settings, todo, session), files, lambda left: done(total - left, total)
-        )
+        results = make(settings, todo, session)
+        return keep_records(todo, results, files, lambda left: done(total - left, total))
 
 
 def open_runs(
@@ -569,9 +567,8 @@ def preset_settings(
     check_name("preset", preset, PRESETS)
     chosen = PRESETS[preset]
     preset_values = {"count": min(count or chosen.count, chosen.count), "equal_time": chosen.equal_time}
+    sets = (*chosen.problems, *problems)
     return [
-        BenchSettings(
-            chosen.planners, (*chosen.problems, *problems), out, time_limit=limit, **preset_values, **more
-        )
+        BenchSettings(chosen.planners, sets, out, time_limit=limit, **preset_values, **more)
         for limit in chosen.limits
     ]

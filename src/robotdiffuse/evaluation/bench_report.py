@@ -239,9 +239,8 @@ def success_over_time(section: Section, planners: Sequence[str]) -> str:
 
 def length_over_time(section: Section, planners: Sequence[str]) -> str:
     """Draw the median ratio of path length to the best known length over time; returns SVG."""
-    return _over_time(
-        section.curves, planners, "joint length / best known", lambda curve: (curve.times, curve.ratios)
-    )
+    label = "joint length / best known"
+    return _over_time(section.curves, planners, label, lambda curve: (curve.times, curve.ratios))
 
 
 def _over_time(

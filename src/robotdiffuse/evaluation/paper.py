@@ -519,7 +519,8 @@ def denoising(problem: Problem) -> list[Noisy]:
         states.append((level / model.schedule.steps, model.hold_ends(x.copy(), reference)))
         return predict(x, level)
 
-    x = SAMPLERS.load("ddim")(recorded, model.schedule, lambda: model.draw_noise(1, rng), SHOWN_STEPS, 0.0)
+    draw = SAMPLERS.load("ddim")
+    x = draw(recorded, model.schedule, lambda: model.draw_noise(1, rng), SHOWN_STEPS, 0.0)
     states.append((0.0, model.hold_ends(x.copy(), reference)))
     motions = []
     for level, state in [*(states[i] for i in SHOWN), states[-1]]:
@@ -598,10 +599,7 @@ def compared_motions(bench: Bench) -> Compared | None:
 
     best = max(keys, key=ratio)
     case = next(case for name in (POSE, JOINT) for case in read_cases(bench.folder, name) if case.key == best)
+    names = case.problem.robot.joint_names
     return Compared(
-        case,
-        {
-            planner: Path(case.problem.robot.joint_names, by_key[best].waypoints)
-            for planner, by_key in solved.items()
-        },
+        case, {planner: Path(names, by_key[best].waypoints) for planner, by_key in solved.items()}
     )

@@ -219,13 +219,8 @@ def read_yaml(file: FilePath, topic: str | None = None) -> RecordedMotion:
 
 def write_yaml(problem: Problem, trajectory: Trajectory, file: FilePath) -> None:
     """Write a JointTrajectory as `ros2 topic pub` takes it; see `interop.write_motion`."""
-    text = yaml.dump(
-        joint_trajectory(trajectory),
-        Dumper=yaml.CSafeDumper,
-        sort_keys=False,
-        default_flow_style=None,
-        width=110,
-    )
+    record = joint_trajectory(trajectory)
+    text = yaml.dump(record, Dumper=yaml.CSafeDumper, sort_keys=False, default_flow_style=None, width=110)
     write_atomically(file, text)
 
 

@@ -240,9 +240,8 @@ def weights_for(name: str, robot: Robot) -> FilePath | None:
 @kept_by_stamp
 def identity(name: str, folder: FilePath) -> RobotIdentity:
     """The robot that weights were trained for. Raises InputError for a damaged description."""
-    return RobotIdentity.from_json(
-        read_description(folder, name).get("robot"), f"{folder / name}.json: robot"
-    )
+    about = read_description(folder, name)
+    return RobotIdentity.from_json(about.get("robot"), f"{folder / name}.json: robot")
 
 
 def folder_of(folder: str | FilePath) -> FilePath:

@@ -5,6 +5,8 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
 
 from robotdiffuse.core.errors import shown
 from robotdiffuse.core.types import Configuration
@@ -48,21 +50,28 @@ FOCAL_FACTORS = (0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0)
 """Factors for the focal length that are tried, in case the image was resized after the calibration."""
 
 
-def agreement(
-    view: DepthView, robot: Robot, q: Configuration, shift: tuple[int, int] = (0, 0)
-) -> tuple[float, float, int]:
-    """Compares an image with the arm's model at a configuration.
+Cells = Float32[ndarray, "rows columns"]
+"""Depth of each cell of an image [m]."""
 
-    Returns, for the image cells in which the model shows the arm: the fraction whose depth is the arm's, the
-    fraction that sees through the arm (larger depths), and the number of these cells. shift: by how many
-    cells the model's image is moved down and to the right.
-    """
+
+def agreement(view: DepthView, robot: Robot, q: Configuration) -> tuple[float, float, int]:
+    """Compares an image with the arm's model at a configuration; see `_compared`."""
+    return _compared(*_images(view, robot, q))
+
+
+def _images(view: DepthView, robot: Robot, q: Configuration) -> tuple[Cells, Cells]:
+    """The depths of the image's cells, and those at which the model at a configuration shows the arm
+    (infinite elsewhere) [m]."""
     step = min(max(1, round(STEP_ANGLE * view.intrinsics[0])), *view.depth.shape)
     cells = view.depth[step // 2 :: step, step // 2 :: step]
     fx, fy, cx, cy = view.intrinsics
     coarse = (fx / step, fy / step, (cx - step // 2) / step, (cy - step // 2) / step)
-    arm = ray_cast(NOTHING, view.T_base_camera, coarse, cells.shape[::-1], robot, q).depth
-    arm = np.roll(arm, shift, (0, 1))
+    return cells, ray_cast(NOTHING, view.T_base_camera, coarse, cells.shape[::-1], robot, q).depth
+
+
+def _compared(cells: Cells, arm: Cells) -> tuple[float, float, int]:
+    """For the cells in which the model shows the arm: the fraction whose depth is the arm's, the fraction
+    that sees through the arm (larger depths), and the number of these cells."""
     compared = np.isfinite(arm) & (cells > 0)
     behind = cells[compared] - arm[compared] - SPHERES_AHEAD
     if not len(behind):
@@ -137,10 +146,12 @@ def _camera_note(view: DepthView, robot: Robot, joint_values: tuple[float, ...])
     best = ""
     highest = max(MIN_NAMED, BETTER * agreed if count >= MIN_CELLS else 0.0)
     for name, other in mistakes(view):
-        agrees, _, other_count = agreement(other, robot, q)
+        cells, arm = _images(other, robot, q)
+        agrees, _, other_count = _compared(cells, arm)
         if other_count < MIN_CELLS or agrees <= highest:
             continue
-        if max(agreement(other, robot, q, shift)[0] for shift in SHIFTS) < agrees - STANDS_OUT:
+        moved = [_compared(cells, np.roll(arm, shift, (0, 1)))[0] for shift in SHIFTS]
+        if max(moved) < agrees - STANDS_OUT:
             best = name
             highest = agrees
     if best or count < MIN_CELLS or through < MIN_THROUGH:

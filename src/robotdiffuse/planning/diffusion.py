@@ -150,9 +150,8 @@ class Diffusion(ExportedPlanner[DiffusionSettings]):
         reason = f"{len(valid)} of {len(samples)} samples of the network are valid"
         # If no sample is valid, the last one is validated again, so that the result names its violation.
         for path in sorted(valid or samples[-1:], key=lambda path: path.length):
-            result = context.finish(
-                path.positions, "network", f"solved by network: {reason}", keeps=context.keeps_constraints
-            )
+            solved_reason = f"solved by network: {reason}"
+            result = context.finish(path.positions, "network", solved_reason, keeps=context.keeps_constraints)
             if result is not None:
                 return result
         return context.unsolved(reason)

@@ -482,7 +482,8 @@ def _main(connection: Connection) -> None:
     threading.Thread(target=_this.receive, daemon=True).start()
     try:
         _this.send(0.0)  # the message for which `Worker._start` waits
-        entries, prepare, arguments = pickle.loads(_this.calls.get()[1])
+        _, message = _this.calls.get()
+        entries, prepare, arguments = pickle.loads(message)
         adopt_entries(entries)
         _this.send(pickle.dumps((prepare(*arguments), None)))
     except BrokenPipeError:  # the parent has died

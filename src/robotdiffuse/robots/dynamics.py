@@ -102,7 +102,7 @@ class Dynamics:
             frame = robot.link_frame(name)
             body = pinocchio.Inertia(inertia.mass, inertia.com, inertia.moments)
             model.appendBodyToJoint(frame, body, pinocchio.SE3(T[:3, :3], T[:3, 3]))
-        up = np.eye(3)[2] if T_world_base is None else T_world_base[2, :3]
+        up = np.array([0.0, 0.0, 1.0]) if T_world_base is None else T_world_base[2, :3]
         model.gravity.linear = -GRAVITY * up
         self._model, self._data = model, model.createData()
         self._bodies = [
@@ -186,7 +186,8 @@ class Dynamics:
 
     def holding_torques(self, q: Configurations) -> Configurations:
         """Torques at rest [N m] or [N]."""
-        return self.torques(q, 0 * q, 0 * q)
+        still = np.zeros_like(q)
+        return self.torques(q, still, still)
 
     def overload_message(self, q: Configuration) -> str | None:
         """A message about the joint with the largest torque at rest relative to its limit; None if all

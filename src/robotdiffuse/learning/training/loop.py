@@ -203,7 +203,7 @@ class Position:
     skipped: int = 0
     """Number of steps that were skipped because loss or gradient was not finite."""
     bad: int = 0
-    """Number of the last of them without a good step between."""
+    """Number of steps that were skipped since the last good step."""
 
 
 class TrainingRun:
@@ -277,12 +277,8 @@ class TrainingRun:
                     last = now
                     if self.at.step % LOG_EVERY == 0:
                         self._log(None)
-                        progress.update(
-                            bar,
-                            completed=self.fraction,
-                            rate=f"{rate:,.0f}/s",
-                            loss=f"{self.rows[-1]['loss']:.4f}",
-                        )
+                        text = f"{self.rows[-1]['loss']:.4f}"
+                        progress.update(bar, completed=self.fraction, rate=f"{rate:,.0f}/s", loss=text)
                     if due:
                         self._checkpoint(progress.console)
                         saved = time.monotonic()

@@ -460,9 +460,8 @@ class Explorer:
         ends = near_ends(self.map, (as_seen.start, *goals))
         not_shown = self._looked_for & self.map.unknown
         blocked = surface((self.map.occupied | not_shown) & ~ends)
-        avoided = cover(
-            self.map, self.scene, MAP.centers(blocked), MAP.edge, "occupied, or looked for in vain"
-        )
+        name = "occupied, or looked for in vain"
+        avoided = cover(self.map, self.scene, MAP.centers(blocked), MAP.edge, name)
         avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
         results = list[tuple[PlanResult, Voxels]]()
         for seed in range(self._seed, self._seed + TENTATIVE_MOTIONS):

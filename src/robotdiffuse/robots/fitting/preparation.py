@@ -415,7 +415,9 @@ def _beyond_spheres(robot: Robot, pair: PairFalseCollisions, settings: Preparati
     """Whether even the finest spheres of a pair would collide falsely too often, or those of an earlier
     refinement (`k` > 0) do, and one or two joints are between the links, so that a table can be used
     instead."""
-    narrow_fraction = 1.0 if k else (pair.gaps < 2 * settings.finest).mean() if len(pair.gaps) else 0.0
+    narrow_fraction = (pair.gaps < 2 * settings.finest).mean() if len(pair.gaps) else 0.0
+    if k:
+        narrow_fraction = 1.0
     hopeless = narrow_fraction * (pair.by_spheres - pair.by_parts) > settings.max_false_collisions / 3
     return bool(hopeless) and len(robot.joints_between(*pair.links)) in (1, 2)
 
