@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers.made_arms import chain, read_urdf, row, written
+from helpers.made_arms import chain, joint, link, read_urdf, row, written
 from helpers.refusals import refuses
 from robotdiffuse import Box, Scene, Sphere, load_robot
 from robotdiffuse.collision import CollisionChecker
@@ -75,6 +75,17 @@ def test_a_scaled_arm_looks_up_positions_of_prismatic_joints_in_a_scaled_table()
     (large,) = scaled(replace(load_robot("panda"), tables=(table,)), 1.5).tables
     positions = np.linspace(-0.01, 0.05, 50)
     np.testing.assert_array_equal(large.at(1.5 * positions), table.at(positions))
+
+
+def test_mimic_joints_of_a_scaled_arm_follow_as_far(tmp_path: Path) -> None:
+    """Regression: offsets of prismatic mimic joints were not scaled, nor were ratios of turns and lengths."""
+    slide = "prismatic", "0 0 0.1", "0 0 1", 'lower="-1" upper="1"'
+    follow = '<mimic joint="a" multiplier="0.5" offset="0.03"/>'
+    tail = [link("l1"), link("l2"), joint("b", "a_link", "l1", *slide, follow), joint("c", "l1", "l2", more=follow)]
+    robot = read_urdf(written(tmp_path, chain("base", ["a"], kind="prismatic"), *tail, chain("l2", ["d"])), locked={"a": 0.2})
+    expected = robot.fk([0.3], "d_link")
+    expected[:3, 3] *= 1.5
+    np.testing.assert_allclose(scaled(robot, 1.5).with_locked({"a": 0.3}).fk([0.3], "d_link"), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", FAMILIES)

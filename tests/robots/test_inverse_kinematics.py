@@ -39,6 +39,16 @@ def test_solutions_are_exact_distinct_and_within_limits(name: str) -> None:
         assert all(np.abs(one - other).max() > 0.1 for one, other in combinations(q, 2))
 
 
+def test_a_joint_that_hardly_moves_stays_within_its_limits() -> None:
+    """Regression: a range below twice the margin of the limits was turned around, and values were outside of it."""
+    arm = example_robot("ur5")
+    joints = tuple(replace(j, lower=0.5, upper=0.5 + 1e-6) if j.name == arm.joint_names[0] else j for j in arm.joints)
+    robot = replace(arm, joints=joints)
+    middle = (robot.lower + robot.upper) / 2 + 0.3 * (np.arange(robot.dof) > 0)
+    q = robot.ik(robot.fk(middle), near=middle)
+    assert len(q) and (q >= robot.lower).all() and (q <= robot.upper).all()
+
+
 def test_ur5_has_at_most_eight_solutions() -> None:
     """A 6R arm with a nearly spherical wrist and joints of one turn has eight solutions."""
     robot = example_robot("ur5")

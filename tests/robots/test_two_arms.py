@@ -190,6 +190,18 @@ def test_both_arms_reach_as_far_as_one() -> None:
         assert radius <= reach_bound(robot)
 
 
+def test_reach_is_that_of_the_arm_that_moves_and_does_not_depend_on_the_mounting() -> None:
+    """Regression: the shoulder of an arm on a wall was not on its first axis, and a held arm on a torso that turns counted
+    as one with its shoulder at the torso's joint."""
+    for robot in (two_arms(), rd.load_robot("ur5e")):
+        mounted = robot.placed_in_world(rd.pose([1, 2, 3], rpy=[1.2, 0.4, -0.3]))
+        assert mounted.reach == pytest.approx(robot.reach, rel=1e-9)
+    held = {name: 0.0 for name in two_arms().joint_names if name.startswith("left")}
+    assert two_arms().with_locked(held).reach == pytest.approx(
+        replace(two_arms(), tip="right_hand", other_tips=()).reach, rel=0.01
+    )
+
+
 def test_the_shoulder_of_one_joint_is_the_joint(tmp_path: Path) -> None:
     """Regression: its height counted twice."""
     assert read_urdf(written(tmp_path, chain("base", ["hinge"]))).reach == pytest.approx(0.0, abs=1e-9)

@@ -38,7 +38,6 @@ from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.bodies import RigidShape
 from robotdiffuse.robots.fitting.preparation import add_robot
-from robotdiffuse.robots.parsing.srdf import srdf_beside
 from robotdiffuse.robots.parsing.urdf import UrdfTree, with_limits
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import ROBOT_FILE, user_robots
@@ -480,7 +479,7 @@ def _robot(urdf: str | Path, tip: str, srdf: str | Path | None, package: str) ->
             raise InputError(f"package_keyword_replacement is {shown(package)}; it must be a folder")
         packages = {entry.name: entry for entry in Path(package).iterdir() if entry.is_dir()}
     tree = UrdfTree(file_name(urdf, "urdf"), packages)  # refuses xacro, which can run code
-    semantics = srdf or srdf_beside(urdf, tree.name)
+    semantics = srdf or tree.srdf
     content = read_bytes(semantics, "srdf") if semantics else b""
     content += f"{tree.digest} {tip} {bool(srdf)}".encode()
     folder = user_robots() / f"{Path(urdf).stem}-{hashlib.sha256(content).hexdigest()[:8]}"

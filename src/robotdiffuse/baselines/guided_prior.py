@@ -332,8 +332,7 @@ class MPD(GuidedPrior[MPDSettings]):
         robot = checker.robot
         for _ in range(GUIDE_STEPS):
             gradient = collision_gradient(checker, q, settings.margin, settings.self_margin, settings.between)
-            limit_margin = np.minimum(LIMIT_MARGIN, (robot.upper - robot.lower) / 2)
-            within_limits = np.clip(q, robot.lower + limit_margin, robot.upper - limit_margin)
+            within_limits = np.clip(q, *robot.narrowed_limits(LIMIT_MARGIN))
             moves = limited(-COLLISION_WEIGHT * gradient, settings.push) + (within_limits - q)
             moves[:, [0, -1]] = 0.0
             q = implicit_step((q + moves).astype(np.float32), PRIOR_WEIGHT)

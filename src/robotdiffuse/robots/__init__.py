@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import lru_cache
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from robotdiffuse.core.errors import InputError, check_name, check_type
 from robotdiffuse.core.input_files import is_file
@@ -31,8 +32,9 @@ def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robo
     MuJoCo model.
 
     A URDF or MuJoCo model is looked up by content among the added robots. If none was made from it, the robot
-    is prepared, which takes about a minute, and stored. If several robots that differ were made from it, an
-    InputError asks for a name. Calls return the same object as long as the robot's files are unchanged.
+    is prepared, which takes about a minute, and stored. If several robots that differ were made from it, or
+    its SRDF has changed since, an InputError says so. Calls return the same object as long as the robot's
+    files are unchanged.
 
     Args:
         name: Name, robot folder, URDF, or MuJoCo model (.xml). Only `robot add` reads xacro files, since
@@ -97,9 +99,9 @@ def _read_state(folder: Path, source: str | None, *_states: tuple[int, int, int]
 
 
 @lru_cache
-def _digest(folder: Path, _state: tuple[int, int, int] | None) -> str | None:
-    """SHA-256 of the URDF from which the robot in a folder was made; None if unknown."""
-    return read_source(folder).get("sha256")
+def _source(folder: Path, _state: tuple[int, int, int] | None) -> dict[str, Any]:
+    """`read_source`, cached."""
+    return read_source(folder)
 
 
 def known_robots() -> dict[str, Path]:
@@ -120,11 +122,18 @@ def _from_urdf(urdf: Path) -> Robot:
     tree = UrdfTree(urdf, {})
     source = str(urdf.resolve())
     digest = tree.digest
+    srdf = tree.srdf_digest
     robots: dict[str, Robot] = {}
+    outdated = list[str]()
     for name, folder in _added().items():
         try:
-            if _digest(folder, _state(folder / ROBOT_FILE)) == digest:
+            made_from = _source(folder, _state(folder / ROBOT_FILE))
+            if made_from.get("sha256") != digest:
+                continue
+            if made_from.get("srdf", srdf) == srdf:
                 robots[name] = _read(folder, source)
+            else:
+                outdated.append(name)
         except InputError:
             continue  # another robot's damaged folder must not prevent loading this one
     if len({(robot_fingerprint(robot), json.dumps(robot.poses)) for robot in robots.values()}) > 1:
@@ -134,6 +143,11 @@ def _from_urdf(urdf: Path) -> Robot:
         )
     if robots:
         return next(iter(robots.values()))
+    if outdated:
+        raise InputError(
+            f"{urdf}: its SRDF has changed since robot {outdated[0]} was made; make it again, with the same "
+            f"options: robotdiffuse robot add {urdf} --name {outdated[0]}; or load it by its name"
+        )
     report = add_robot(urdf, out=user_robots() / f"{tree.name}-{digest[:8]}")
     note = f"{report.sphere_count} spheres were fitted to {urdf.name} and stored in {report.folder}"
     return replace(report.robot, notes=(*report.robot.notes, note), source=source)

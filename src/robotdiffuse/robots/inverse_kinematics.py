@@ -96,8 +96,7 @@ def inverse_kinematics(
     accepted = np.zeros((0, robot.dof))
     if _out_of_reach(chain, target):
         return accepted
-    lower = robot.lower + LIMIT_MARGIN
-    upper = robot.upper - LIMIT_MARGIN
+    lower, upper = robot.narrowed_limits(LIMIT_MARGIN)
     parameters = PARAMETERS._replace(position_only=settings.position_only)
     stale_rounds = 0
     for i in range(settings.max_rounds):
@@ -164,8 +163,7 @@ def ik_chain(robot: KinematicTree, frame: str, limit_margin: float) -> tuple[Int
         raise InputError(f"inverse kinematics: no planned joint moves the link {shown(frame)}")
     arm = np.flatnonzero(~on_other_arm(robot, frame))
     kinds = np.array([KINDS[joint.kind] for joint in robot.planned_joints])[arm]
-    lower = robot.lower[arm] + limit_margin
-    upper = robot.upper[arm] - limit_margin
+    lower, upper = (limits[arm] for limits in robot.narrowed_limits(limit_margin))
     tool = for_kernels(robot.T_frame_link(frame))
     return arm, IKChain(robot.frame_offsets[arm], tool, kinds, len(robot.chain(frame)), lower, upper)
 

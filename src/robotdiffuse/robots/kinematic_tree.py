@@ -204,6 +204,11 @@ class KinematicTree(Value):
     effort = _limit("effort")
     """Largest torques [N m] or forces [N]; 0 where the URDF gives none."""
 
+    def narrowed_limits(self, margin: float) -> tuple[JointValues, JointValues]:
+        """Lower and upper limits narrowed by a margin [rad] or [m], at most to the middle of the range."""
+        margins = np.minimum(margin, (self.upper - self.lower) / 2)
+        return self.lower + margins, self.upper - margins
+
     def limit_excess(self, q: JointArray) -> JointArray:
         """How far joint values exceed the limits [rad] or [m]; negative within the limits, 0 for continuous
         joints."""
@@ -384,19 +389,20 @@ class KinematicTree(Value):
     def reach(self) -> float:
         """Distance between tip and shoulder that 99 % of the configurations do not exceed [m].
 
-        The shoulder is the point on the first joint's axis at the height of the second joint, or of the first
-        if it is the only one. With several arms, the largest reach of an arm is returned.
+        The shoulder is the point on the first joint's axis that is nearest to the second joint, or to the
+        first if it is the only one. With several arms, the largest reach of an arm is returned.
         """
         q = np.random.default_rng(0).uniform(self.lower, self.upper, (REACH_SAMPLES, self.dof))
         frames = self.frames_at(q)
         reached = []
-        for tip in self.tips:
-            first = list(self.chain(tip)[:2])
-            if not first:  # all joints of this arm are locked
+        chains = [*map(self.chain, self.tips)]
+        for tip, chain in zip(self.tips, chains, strict=True):
+            if any({*chain} < {*other} for other in chains):  # all joints of this arm alone are locked
                 continue
-            offsets = self.frame_offsets[first]
-            second = offsets[0] @ offsets[1] if len(first) > 1 else offsets[0]
-            shoulder = np.array([*offsets[0, :2, 3], second[2, 3]])
+            offsets = self.frame_offsets[list(chain[:2])]
+            axis, origin = offsets[0, :3, 2:].T
+            to_second = offsets[0, :3, :3] @ offsets[1, :3, 3] if len(chain) > 1 else 0 * axis
+            shoulder = origin + axis * (axis @ to_second)
             origins = (frames[self.link_frame(tip)] @ self.T_frame_link(tip))[:, :3, 3]
             reached.append(np.linalg.norm(origins - shoulder, axis=1))
         return float(np.quantile(reached, REACH_QUANTILE, axis=1).max())

@@ -40,6 +40,7 @@ from robotdiffuse.robots.kinematic_tree import (
     TURN,
     Joint,
     KinematicTree,
+    Mimic,
     with_mimics,
 )
 
@@ -536,8 +537,13 @@ def scaled(robot: Robot, scale: float) -> Robot:
     factors = {joint.name: scale if joint.kind == "prismatic" else 1.0 for joint in arm.joints}
 
     def sized(joint: Joint) -> Joint:
-        limits = {name: factors[joint.name] * getattr(joint, name) for name in ("lower", "upper")}
-        return replace(joint, T_parent_joint=_with_scaled_position(joint.T_parent_joint, scale), **limits)
+        by = factors[joint.name]
+        mimic = joint.mimic
+        if mimic is not None:
+            multiplier = by / factors.get(mimic.joint, 1.0) * mimic.multiplier
+            mimic = Mimic(mimic.joint, multiplier, by * mimic.offset)
+        T = _with_scaled_position(joint.T_parent_joint, scale)
+        return replace(joint, T_parent_joint=T, lower=by * joint.lower, upper=by * joint.upper, mimic=mimic)
 
     def sized_table(table: LinkPairTable) -> LinkPairTable:
         by = np.array([factors[name] for name in table.joints])

@@ -1,5 +1,6 @@
 """MuJoCo models: frames, limits and collisions against MuJoCo itself; scenes; models that are refused."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -293,6 +294,36 @@ def test_a_base_on_slides_without_range_is_held(actuator: str, tmp_path: Path) -
     assert robot.poses["home"] == {"j": 0.5}
     assert any("slide joint x" in note and "is held" in note for note in robot.notes)
     np.testing.assert_allclose(robot.fk(np.array([0.0]), "base")[:3, 3], [0.1, 0, 0.2], atol=1e-12)
+
+
+def test_a_free_body_with_joints_is_the_robot_if_nothing_else_is(tmp_path: Path) -> None:
+    """Regression: a humanoid without actuators "has no robot: no body is moved by a hinge or a slide joint"."""
+    free = '<joint name="x" type="free"/>'
+    (tmp_path / "m.xml").write_text(re.sub("<joint name=.x.*?/>", free, PLACED).replace("0.3 0.5", "0 0 1 1 0 0 0 0.5"))
+    tree = UrdfTree(tmp_path / "m.xml", {})
+    assert tree.robot().joint_names == ("j",)
+    assert any("the free joint of base is held" in note for note in tree.notes)
+
+
+OVERLAPPING = """
+<mujoco><worldbody><body name="base"><geom size="0.1"/>
+  <body name="arm" pos="0 0 0.3"><joint name="a" axis="0 0 1" range="-90 90"/><geom size="0.05"/>
+    <body name="cuff" pos="0 0 0.1"><joint name="b" axis="0 0 1" range="-90 90"/><geom size="0.03"/>
+      <body name="ring" pos="0 0 -0.1"><joint name="c" axis="0 0 1" range="-90 90"/><geom size="0.03"/>{}</body>
+  </body></body></body></worldbody></mujoco>
+"""
+FINGERS = """<body name="palm" pos="0 0 0.3"><joint name="d" axis="0 1 0" range="-90 90"/><geom size="0.02"/>
+  <body name="f" pos="0.01 0 0.1"><joint name="finger1" type="slide" axis="1 0 0" range="0 0.1"/><geom size="0.02"/></body>
+  <body name="g" pos="-0.01 0 0.1"><joint name="finger2" type="slide" axis="1 0 0" range="-0.1 0"/><geom size="0.02"/></body>
+</body>"""
+
+
+def test_links_that_always_touch_are_noted(tmp_path: Path) -> None:
+    """Regression: pairs that MuJoCo checks were dropped without a note if they always overlap; so were those of held links."""
+    (tmp_path / "m.xml").write_text(OVERLAPPING.format(FINGERS))
+    with coarse_grids():
+        robot = add_robot(tmp_path / "m.xml", out=tmp_path / "robot", settings=QUICK).robot
+    assert "links that touch in all motions are not checked: arm/ring, f/g" in robot.notes
 
 
 TURNED = """

@@ -278,6 +278,27 @@ def test_preparations_of_one_urdf_that_differ_are_refused(tmp_path: Path, monkey
     refuses("was added as limited, plain, same, which differ", load_robot, file)
 
 
+@pytest.mark.parametrize("given", [True, False])
+def test_a_robot_whose_srdf_changed_is_to_be_made_again(given: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: a URDF was loaded with the poses and exclusions of its former SRDF."""
+    monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
+    file = written(tmp_path, chain("base", row("j", 3)))
+    srdf = tmp_path / "made.srdf"
+    srdf.write_text("<robot name='made'/>")
+    other = tmp_path / "other.srdf"
+    other.write_text("<robot name='made'> </robot>")
+    with coarse_grids():
+        made = add_robot(file, settings=QUICK, srdf=srdf if given else None).robot
+        same(load_robot(file), made)
+        srdf.write_text("<robot name='made'><group_state name='up'><joint name='j1' value='1'/></group_state></robot>")
+        refuses(r"its SRDF has changed since .*robot add .*made.urdf --name made; or load it by its name", load_robot, file)
+        same(load_robot("made"), made)
+        add_robot(file, settings=QUICK, name="again", srdf=srdf if given else None)
+        assert load_robot(file).poses == {"up": {"j1": 1.0}}
+        add_robot(file, settings=QUICK, name="again", srdf=other)
+    assert load_robot(file).poses == {}, "a robot with another SRDF does not depend on this one"
+
+
 @pytest.mark.parametrize("name", ["panda", "my.urdf", "two\nlines"])
 def test_names_by_which_an_added_robot_could_not_be_loaded_are_refused(name: str, tmp_path: Path) -> None:
     """Regression: the bundled panda was used in place of an added robot with this name."""

@@ -14,13 +14,14 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, check_name
+from robotdiffuse.core.errors import InputError, check_name, joined
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.types import Mask, Points, Poses, Spheres
 from robotdiffuse.robots.bodies import Surface
@@ -47,7 +48,7 @@ from robotdiffuse.robots.fitting.sphere_fitting import (
     stick_out,
 )
 from robotdiffuse.robots.kinematic_tree import MOVING_KINDS
-from robotdiffuse.robots.parsing.srdf import read_srdf, srdf_beside
+from robotdiffuse.robots.parsing.srdf import read_srdf
 from robotdiffuse.robots.parsing.urdf import UrdfTree, read_limits
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import (
@@ -546,6 +547,20 @@ class AddReport(NamedTuple):
         return (*warnings, *(f"spheres do not cover {link.link}" for link in self.links if not link.covered))
 
 
+def always_touching(prepared: Prepared) -> list[tuple[str, str]]:
+    """Pairs of links that sampling allows because they always collide, and pairs of links that planning does
+    not move relative to each other and that collide."""
+    robot = prepared.robot
+    links = Links(robot)
+    poses = links.poses(links.named({})[None])
+    pairs = [pair.links for pair in prepared.sampled if pair.reason == "always"]
+    return pairs + [
+        pair
+        for pair in combinations(robot.meshes, 2)
+        if robot.link_frame(pair[0]) == robot.link_frame(pair[1]) and links.collide(poses, *pair, 0)
+    ]
+
+
 def add_robot(
     urdf: str | Path,
     name: str | None = None,
@@ -586,7 +601,7 @@ def add_robot(
     """
     begin = time.process_time()
     tree = UrdfTree(Path(urdf), packages or {}, compile_xacro=True)
-    srdf_file = Path(srdf) if srdf is not None else None if tree.semantics else srdf_beside(urdf, tree.name)
+    srdf_file = tree.srdf if srdf is None else Path(srdf)
     semantics = tree.semantics if srdf_file is None else read_srdf(srdf_file)
     changed, notes = ({}, ()) if limits is None else read_limits(limits)
     robot = tree.robot(base, tip, locked, group, semantics, changed)
@@ -622,6 +637,12 @@ def add_robot(
     if semantics is not None and semantics is tree.semantics:
         settings = replace(settings, sampling=replace(settings.sampling, assumptions=False))
     prepared = prepare(robot, surfaces, settings, seed, progress, allowed)
+    if not settings.sampling.assumptions:
+        touching = ["/".join(pair) for pair in always_touching(prepared) if frozenset(pair) not in allowed]
+        if touching:
+            note = f"links that touch in all motions are not checked: {joined(touching)}"
+            robot = replace(robot, notes=(*robot.notes, note))
+
     measured = prepared.false_collisions
     if measured.free == 0 or measured.by_spheres == 1:  # nothing can be planned
         shares = {pair.links: max(pair.colliding, pair.by_spheres) for pair in measured.pairs}
@@ -641,6 +662,8 @@ def add_robot(
         if semantics is not None and (pair.reason == "checked") == (frozenset(pair.links) in srdf_allowed)
     )
     source = {"urdf": Path(urdf).name, "sha256": tree.digest, "license": license}
+    if srdf is None or (tree.srdf and tree.srdf.samefile(srdf)):
+        source["srdf"] = tree.srdf_digest
     fractions = {"free": round(measured.free, 4), "refused": round(measured.by_spheres, 4)}
     note = (
         f"{measured.free:.1%} of the configurations are free of self-collision; convex parts "

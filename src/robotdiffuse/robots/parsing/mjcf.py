@@ -80,7 +80,7 @@ def colliding_geoms(model: Any) -> Bool[ndarray, "_"]:
 def robot_bodies(model: Any) -> list[int]:
     """The bodies of the robot, parents before children: the bodies of all kinematic trees that actuators of
     joints move. If there is no such tree, the robot is all trees with hinges or slides and without a free
-    joint."""
+    joint, or else, as for a humanoid, all trees with hinges or slides."""
     roots = model.body_rootid[model.jnt_bodyid]
     kinds = [kind_of("Joint", kind) for kind in model.jnt_type]
     chosen = {
@@ -89,7 +89,8 @@ def robot_bodies(model: Any) -> list[int]:
         if kind_of("Trn", model.actuator_trntype[k]) in ("joint", "jointinparent")
     }
     if not chosen:
-        chosen = {*roots[np.isin(kinds, MOVABLE)]} - {*roots[np.isin(kinds, "free")]}
+        moving = {*roots[np.isin(kinds, MOVABLE)]}
+        chosen = moving - {*roots[np.isin(kinds, "free")]} or moving
     return np.flatnonzero(np.isin(model.body_rootid, [*chosen])).tolist()
 
 

@@ -42,7 +42,7 @@ from robotdiffuse.robots.fitting.convex_parts import MIN_THICKNESS, Surface, con
 from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT, MOVING_KINDS, Joint, Mimic, with_mimics
 from robotdiffuse.robots.parsing.mjcf import ConvertedModel, ellipsoid
 from robotdiffuse.robots.parsing.packages import Packages, compiled_xacro, is_xacro, with_prefixes
-from robotdiffuse.robots.parsing.srdf import Srdf, linkage_notes, planned_joints
+from robotdiffuse.robots.parsing.srdf import Srdf, linkage_notes, planned_joints, srdf_beside
 from robotdiffuse.robots.robot import Robot
 
 ROTATING_KINDS = ("revolute", "continuous")
@@ -291,6 +291,17 @@ class UrdfTree:
             for mesh in element.findall(f"{self.kind}/geometry/mesh"):
                 digest.update(read_bytes(self.packages.file(mesh.get("filename", "")), "mesh file"))
         return digest.hexdigest()
+
+    @property
+    def srdf(self) -> Path | None:
+        """The SRDF that belongs to the file (see `srdf_beside`); None if there is none, and for a MuJoCo
+        model."""
+        return None if self.semantics else srdf_beside(self.path, self.name)
+
+    @property
+    def srdf_digest(self) -> str:
+        """SHA-256 of the SRDF that belongs to the file; empty if there is none."""
+        return hashlib.sha256(read_bytes(self.srdf, "SRDF")).hexdigest() if self.srdf else ""
 
     def _named(self, root: ET.Element, what: str) -> dict[str, ET.Element]:
         """The links or joints by name."""
