@@ -138,6 +138,11 @@ def _size(kind: str, name: str, value: object) -> ndarray:
     return size
 
 
+def _around(center: ndarray, half: ndarray | float) -> Corners:
+    """Corners of the box around a center with half edges, or with a radius [m]."""
+    return np.stack([center - half, center + half])
+
+
 CHECKS: dict[str, Callable[[str, str, Any], Any]] = {
     "size": _size,
     "center": _vector,
@@ -177,7 +182,7 @@ class Sphere(Shape):
 
     @property
     def bounds(self) -> Corners:
-        return np.stack([self.center - self.radius, self.center + self.radius])
+        return _around(self.center, self.radius)
 
     @property
     def T_base_shape(self) -> Pose:
@@ -241,8 +246,7 @@ class Box(_Posed):
 
     @property
     def bounds(self) -> Corners:
-        half = np.abs(self.rotation) @ self.size / 2
-        return np.stack([self.center - half, self.center + half])
+        return _around(self.center, np.abs(self.rotation) @ self.size / 2)
 
 
 @no_type_check
@@ -280,7 +284,7 @@ class Cylinder(_Axial):
     def bounds(self) -> Corners:
         axis = self.rotation[:, 2]
         half = np.abs(axis) * self.height / 2 + self.radius * np.sqrt(np.clip(1 - axis**2, 0, None))
-        return np.stack([self.center - half, self.center + half])
+        return _around(self.center, half)
 
 
 @no_type_check
@@ -305,8 +309,7 @@ class Capsule(_Axial):
 
     @property
     def bounds(self) -> Corners:
-        half = np.abs(self.rotation[:, 2]) * self.height / 2 + self.radius
-        return np.stack([self.center - half, self.center + half])
+        return _around(self.center, np.abs(self.rotation[:, 2]) * self.height / 2 + self.radius)
 
 
 @no_type_check

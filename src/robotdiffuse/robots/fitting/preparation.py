@@ -547,20 +547,6 @@ class AddReport(NamedTuple):
         return (*warnings, *(f"spheres do not cover {link.link}" for link in self.links if not link.covered))
 
 
-def always_touching(prepared: Prepared) -> list[tuple[str, str]]:
-    """Pairs of links that sampling allows because they always collide, and pairs of links that planning does
-    not move relative to each other and that collide."""
-    robot = prepared.robot
-    links = Links(robot)
-    poses = links.poses(links.named({})[None])
-    pairs = [pair.links for pair in prepared.sampled if pair.reason == "always"]
-    return pairs + [
-        pair
-        for pair in combinations(robot.meshes, 2)
-        if robot.link_frame(pair[0]) == robot.link_frame(pair[1]) and links.collide(poses, *pair, 0)
-    ]
-
-
 def add_robot(
     urdf: str | Path,
     name: str | None = None,
@@ -638,11 +624,20 @@ def add_robot(
         settings = replace(settings, sampling=replace(settings.sampling, assumptions=False))
     prepared = prepare(robot, surfaces, settings, seed, progress, allowed)
     if not settings.sampling.assumptions:
-        touching = ["/".join(pair) for pair in always_touching(prepared) if frozenset(pair) not in allowed]
+        links = Links(prepared.robot)
+        poses = links.poses(links.named({})[None])
+        checked = prepared.robot.checked_pairs()
+        touching = [
+            f"{a} and {b}"
+            for a, b in combinations(robot.meshes, 2)
+            if (a, b) not in checked and frozenset((a, b)) not in allowed and links.collide(poses, a, b, 0)
+        ]
         if touching:
-            note = f"links that touch in all motions are not checked: {joined(touching)}"
+            note = (
+                f"links that touch in all motions are not checked: {joined(touching)}; if joints between "
+                "them are held, --lock may hold them elsewhere"
+            )
             robot = replace(robot, notes=(*robot.notes, note))
-
     measured = prepared.false_collisions
     if measured.free == 0 or measured.by_spheres == 1:  # nothing can be planned
         shares = {pair.links: max(pair.colliding, pair.by_spheres) for pair in measured.pairs}

@@ -294,14 +294,13 @@ def measure_false_collisions(
     pairs = []
     for (a, b), (spheres, parts, meshes, middle) in zip(robot.checked_pairs(), collisions, strict=True):
         false_spheres = np.flatnonzero(spheres & ~parts & free)[:MAX_SPHERE_CASES]
-        gaps = np.array([links.mesh_distance(poses, a, b, int(i)) for i in false_spheres])
-        all_gaps = gaps
+        all_gaps = np.array([links.mesh_distance(poses, a, b, int(i)) for i in false_spheres])
         # leave out the cases with the narrowest gaps, see NARROWEST_FRACTION
-        far_enough = gaps >= np.sort(gaps)[
+        far_enough = all_gaps >= np.sort(all_gaps)[
             : int(samples * NARROWEST_FRACTION * len(false_spheres) / max(spheres.sum(), 1)) + 1
         ].max(initial=0.0)
         false_spheres = false_spheres[far_enough]
-        gaps = gaps[far_enough]
+        gaps = all_gaps[far_enough]
         T_base_a = poses[a][false_spheres]
         T_base_b = poses[b][false_spheres]
         at = np.einsum("nij,nj->ni", T_base_a[:, :3, :3], middle[false_spheres]) + T_base_a[:, :3, 3]
