@@ -256,4 +256,34 @@ def test_motions_are_joined_with_and_without_a_stop() -> None:
     refuses("constraints .or lines. of their own", rd.join, [there, line], 0.05)
     refuses(r"results\[1\] begins .* rad from the end of results\[0\] in", rd.join, [there, there], 0.0)
     refuses("it takes two to join", rd.join, [there], 0.0)
-    refuses(r"results\[1\] is for another robot or scene", rd.join, [there, elsewhere], 0.0)
+    refuses(r"results\[1\] is for another robot, scene or payload", rd.join, [there, elsewhere], 0.0)
+
+
+def test_joined_motions_keep_the_limits_of_the_call() -> None:
+    """Regression: where it was slower, the blended motion was replaced by one that stops, at full speed."""
+    space = panda()
+    there = space.plan("extended", "ready", time_limit=10.0)
+    back = space.plan("ready", there.path.positions[-1], time_limit=10.0)
+    for blend in (0.0, 0.2):
+        motion = rd.join(
+            [there, back], blend, time_limit=20.0, velocity_scaling=0.4, acceleration_scaling=0.2, jerk=80.0
+        ).trajectory
+        assert (np.abs(motion.velocities) <= 0.4 * PANDA.velocity * (1 + 1e-6)).all()
+        assert (np.abs(motion.accelerations) <= 0.2 * PANDA.acceleration * (1 + 1e-6)).all()
+        assert (motion.peak_jerks <= 80.0 * (1 + 1e-6)).all()
+
+
+def test_motions_with_other_payloads_or_moving_obstacles_are_not_joined() -> None:
+    """Regression: those of the first motion counted for all."""
+    scene, end = rd.Scene(), [0.6, 0.2, 0, -1.8, 0, 2.2, 0.2]
+    there = rd.plan(rd.Problem(PANDA, scene, "ready", end), 10.0, until="first")
+    load = rd.Payload(1.0, [0, 0, 0.1])
+    cart = rd.MovingObstacle(rd.Sphere([3.0, 0.0, 0.5], 0.1, "cart"), velocity=[0.1, 0.0, 0.0])
+    for more in ({"payload": load}, {"moving": [cart]}):
+        back = rd.plan(rd.Problem(PANDA, scene, end, "ready", **more), 10.0, until="first")  # type: ignore[arg-type]
+        refuses("another robot, scene or payload", rd.join, [there, back])
+    both = [
+        rd.plan(rd.Problem(PANDA, scene, *ends, payload=rd.Payload(1.0, [0, 0, 0.1])), 10.0, until="first")
+        for ends in (("ready", end), (end, "ready"))
+    ]
+    assert rd.join(both).problem.payload is not None

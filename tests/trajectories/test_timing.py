@@ -125,11 +125,26 @@ def test_one_joint_against_the_closed_form() -> None:
         assert timed([[0.0], [d]], settings=NO_JERK_LIMIT, robot=robot).duration == pytest.approx(expected, rel=0.01)
 
 
-def test_path_of_length_zero_is_two_rows_at_rest() -> None:
+def test_path_of_length_zero_is_rows_at_rest() -> None:
     for rows in (1, 2, 5):
         t = timed(np.full((rows, 7), 0.3))
-        assert t.times.tolist() == [0.0, TimingSettings().sample_time]
+        assert t.times[0] == 0 and t.duration <= 4 * TimingSettings().sample_time
         assert (t.positions == 0.3).all() and not t.velocities.any() and not t.accelerations.any()
+
+
+@pytest.mark.parametrize("distance", [1e-9, 9e-7])
+@pytest.mark.parametrize("scale", [1.0, 1e-3])
+def test_motions_that_count_as_one_waypoint_keep_all_limits(distance: float, scale: float) -> None:
+    """Regression: such a motion took one time step, with up to 19,000 times the jerk limit that was asked for."""
+    q = np.zeros((2, 7))
+    q[1] = -distance / 7, *[distance / 7] * 6
+    t = timed(q, settings=TimingSettings(velocity_scale=scale, acceleration_scale=scale, jerk=MIN_JERK))
+    assert np.array_equal(t.positions[[0, -1]], q) and not t.velocities[[0, -1]].any()
+    assert (t.peak_jerks <= MIN_JERK).all()
+    start, end = t.cubic_accelerations
+    assert np.allclose(start, t.accelerations[:-1], atol=1e-12) and np.allclose(end, t.accelerations[1:], atol=1e-12)
+    assert (np.abs(t.accelerations) <= scale * np.array(ACCELERATION)).all()
+    assert (np.abs(t.velocities) <= scale * np.array(VELOCITY)).all()
 
 
 def test_corner_is_rounded_when_valid_and_stopped_at_when_not() -> None:

@@ -382,11 +382,11 @@ class Trajectory(Value):
         count = int(np.ceil((self.duration - TIME_TOLERANCE) * rate))
         times = np.append(np.arange(max(count, 1)) / rate, self.duration)
         state = self.at(times)
-        rows = Trajectory(self.joint_names, times, state.positions, state.velocities, state.accelerations)
-        start, end = rows.cubic_accelerations
+        rows = Trajectory(self.joint_names, times, *state[:3])
+        ends = np.stack(rows.cubic_accelerations)
         max_acceleration = np.abs(self.cubic_accelerations).max(axis=(0, 1))
-        off = np.maximum(np.abs(start - rows.accelerations[:-1]), np.abs(end - rows.accelerations[1:]))
-        as_strong = (np.maximum(np.abs(start), np.abs(end)) <= ACCELERATION_GAIN * max_acceleration).all()
+        off = np.abs(ends - (rows.accelerations[:-1], rows.accelerations[1:]))
+        as_strong = (np.abs(ends) <= ACCELERATION_GAIN * max_acceleration).all()
         if self.velocities[[0, -1]].any() or (
             as_strong and (off <= ACCELERATION_SHARE * max_acceleration).all()
         ):
@@ -409,10 +409,8 @@ class Trajectory(Value):
         path = check_output(file, (".json", ".csv"))
         if rate is not None:
             return self.resample(rate).save(path)
-        if path.suffix.lower() == ".json":
-            write_atomically(path, json.dumps(self.record(), allow_nan=False) + "\n")
-        else:
-            write_atomically(path, self._csv())
+        is_json = path.suffix.lower() == ".json"
+        write_atomically(path, json.dumps(self.record(), allow_nan=False) + "\n" if is_json else self._csv())
 
     def record(self) -> dict[str, Any]:
         """Convert the trajectory to JSON values.

@@ -20,6 +20,8 @@ from robotdiffuse.core.errors import InputError, counted, joined, needs, reading
 from robotdiffuse.core.input_files import MAX_YAML_SIZE, parse_yaml, read_json, read_text
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.types import (
+    RATES,
+    ROWS,
     Configurations,
     JointRows,
     Path,
@@ -240,7 +242,7 @@ def motion_from_record(record: Any, where: str) -> RecordedMotion:
 def _motion(record: Any) -> RecordedMotion:
     if not isinstance(record, Mapping):
         raise InputError(f"it is {shown(record)}; {SUPPORTED}")
-    if "status" in record and record.get("status") != "solved":
+    if record.get("status", "solved") != "solved":
         raise InputError(f"it holds no motion: its status is {shown(record['status'])}")
     if "trajectory" in record:
         return _only(record["trajectory"])
@@ -254,7 +256,7 @@ def _motion(record: Any) -> RecordedMotion:
     if "points" in record:
         return _joint_trajectory(record)
     if record.get("times"):
-        q, t, v, a = (record.get(name) for name in ("positions", "times", "velocities", "accelerations"))
+        q, t, v, a = (record.get(name) for name in ("positions", "times", *RATES))
         return checked_motion(record.get("joint_names"), q, t, v, a)
     for name in ("waypoints", "positions"):
         if record.get(name):
@@ -279,22 +281,19 @@ def _joint_trajectory(record: Mapping[str, Any]) -> RecordedMotion:
     points = record["points"]
     if not isinstance(points, list) or not points:
         raise InputError(f"points is {shown(points)}; it must be a list of at least one row")
-    rows: dict[str, list[Any]] = {"positions": [], "velocities": [], "accelerations": []}
     for i, point in enumerate(points):
         if not isinstance(point, Mapping):
             raise InputError(f"points[{i}] is {shown(point)}; it must be a JointTrajectoryPoint")
-        for name, values in rows.items():
-            values.append(_list(point.get(name)))
+    rows = {name: [_list(point.get(name)) for point in points] for name in ROWS}
     times = [
         _seconds(f"points[{i}].time_from_start", p.get("time_from_start", 0)) for i, p in enumerate(points)
     ]
-    for name in ("velocities", "accelerations"):
+    for name in RATES:
         has_values = [len(row) > 0 for row in rows[name]]
         if any(has_values) and not all(has_values):
             raise InputError(f"points[{has_values.index(False)}] has no {name}; other points have them")
-    return checked_motion(
-        _list(record.get("joint_names")), rows["positions"], times, rows["velocities"], rows["accelerations"]
-    )
+    q, v, a = rows.values()
+    return checked_motion(_list(record.get("joint_names")), q, times, v, a)
 
 
 def _list(value: Any) -> list[Any]:
@@ -322,13 +321,8 @@ def time_message(nanoseconds: int) -> dict[str, int]:
 def joint_trajectory(trajectory: Trajectory) -> dict[str, Any]:
     """A trajectory as a trajectory_msgs/msg/JointTrajectory in plain data."""
     points = [
-        {
-            "positions": trajectory.positions[i].tolist(),
-            "velocities": trajectory.velocities[i].tolist(),
-            "accelerations": trajectory.accelerations[i].tolist(),
-            "effort": [],
-            "time_from_start": time_message(round(t * 1e9)),
-        }
+        {name: getattr(trajectory, name)[i].tolist() for name in ROWS}
+        | {"effort": [], "time_from_start": time_message(round(t * 1e9))}
         for i, t in enumerate(trajectory.times.tolist())
     ]
     header = {"stamp": time_message(0), "frame_id": ""}
@@ -370,14 +364,15 @@ def _table(text: str) -> RecordedMotion:
             raise InputError(f"the header has {quantity} of {shown(joint)} more than once")
         columns_of[quantity][joint] = column
     names = list(columns_of["positions"])
-    for quantity in ("velocities", "accelerations"):
+    for quantity in RATES:
         if columns_of[quantity] and sorted(columns_of[quantity]) != sorted(names):
             raise InputError(f"the header has {quantity} of other joints than positions")
     table = {
         quantity: np.transpose([of_joint[name] for name in names]) if of_joint else None
         for quantity, of_joint in columns_of.items()
     }
-    return checked_motion(names, table["positions"], times, table["velocities"], table["accelerations"])
+    q, v, a = table.values()
+    return checked_motion(names, q, times, v, a)
 
 
 def publish(trajectory: Trajectory, host: str, port: int, topic: str, timeout: float) -> None:

@@ -275,8 +275,7 @@ def write_mcap(problem: Problem, trajectory: Trajectory, file: Path) -> None:
         out.writer.add_attachment(0, 0, PROBLEM_ATTACHMENT, "application/json", content)
     except InputError:
         pass  # a robot that was made in Python has no problem file
-    links = [link for link in robot.link_names if link != robot.base]
-    poses = {link: robot.fk(trajectory.positions, link) for link in links}
+    poses = {link: robot.fk(trajectory.positions, link) for link in robot.link_names if link != robot.base}
     for i, t in enumerate(trajectory.times.tolist()):
         at = round(1e9 * t)
         frames = {link: T[i] for link, T in poses.items()}

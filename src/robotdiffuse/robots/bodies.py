@@ -58,8 +58,18 @@ class RigidShape(Protocol):
         ...
 
 
+class EqualByContent(Value):
+    """Base of values that are compared by their content, such as keys of caches."""
+
+    def __hash__(self) -> int:
+        return hash(_content(self))
+
+    def __eq__(self, other: object) -> bool:
+        return _content(self) == _content(other)
+
+
 @dataclass(frozen=True, eq=False)
-class AttachedBody(Value):
+class AttachedBody(EqualByContent):
     """A tool or held object: a body that is fixed to a link of a robot and becomes a link itself."""
 
     name: str
@@ -72,14 +82,6 @@ class AttachedBody(Value):
     """Links that the body may touch, besides those that move with it."""
     tool: bool = False
     """Whether the body is a tool, which may become the tip."""
-
-    # equal by content, since bodies are keys of caches
-
-    def __hash__(self) -> int:
-        return hash(_content(self))
-
-    def __eq__(self, other: object) -> bool:
-        return _content(self) == _content(other)
 
 
 def _content(value: Any) -> object:
@@ -129,7 +131,7 @@ def inertia_of(values: ArrayLike) -> Inertia:
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class Payload(Value):
+class Payload(EqualByContent):
     """A mass that a link carries; joint torques must support it in addition to the arm.
 
     Raises InputError for numbers that are not finite or too large, for negative mass or moments of inertia,

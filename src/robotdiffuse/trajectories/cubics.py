@@ -80,8 +80,8 @@ class Cubics:
             return self.trajectory.times[:0], self.trajectory.positions[:0]
         from scipy.interpolate import CubicHermiteSpline  # slow to import, rarely needed
 
-        rows = self.trajectory.times, self.trajectory.positions, self.trajectory.velocities
-        motion = CubicHermiteSpline(*rows)
+        rows = self.trajectory
+        motion = CubicHermiteSpline(rows.times, rows.positions, rows.velocities)
         roots = np.concatenate(motion.derivative().roots(discontinuity=False, extrapolate=False))
         times = np.unique(roots[np.isfinite(roots)])  # where a joint rests, a root is NaN
         return times, motion(times)

@@ -23,8 +23,10 @@ from robotdiffuse.trajectories.speed_limits import (
     jerk_windows,
     row_count,
     scaled_limits,
+    slowed,
+    within_limits,
 )
-from robotdiffuse.trajectories.timing_kernel import ROUNDING_MARGIN, fastest_speeds, states_at
+from robotdiffuse.trajectories.timing_kernel import fastest_speeds, states_at
 
 GRID_INTERVALS = 128
 """Number of equal intervals of s in which s̈ is constant."""
@@ -50,8 +52,7 @@ def time_curve(
     grid = np.linspace(0.0, knots[-1], GRID_INTERVALS + 1)
     velocity, acceleration = scaled_limits(robot, settings)
     jerk = jerk_limits(robot, settings)
-    best = None
-    shortest_duration = np.inf
+    best: Trajectory | None = None
     for share in ACCELERATION_SHARES:
         limits = derivatives_and_limits(curve, grid, velocity, share * acceleration, extra)
         speeds = fastest_speeds(*limits)
@@ -61,26 +62,23 @@ def time_curve(
         s = states_at(grid, speeds, step * np.arange(count + 1))[0]
         s[-1] = grid[-1]
         # average s over each window; the longer the window, the lower the jerk, and the later the end
-        shortest = np.inf
+        motions = []
         for window in jerk_windows(step, share * acceleration, jerk):
             total = np.cumsum(np.concatenate([np.zeros(window), s, np.full(window, s[-1])]))
             controls = curve((total[window:] - total[:-window]) / window, 0)
             controls[0] = waypoints[0]
             controls[-1] = waypoints[-1]
-            clock, q, v, a = spline_rows(controls, step)
-            # factor on the times with which all limits hold; below 1 if the motion may be faster
-            factor = ROUNDING_MARGIN * max(
-                float((np.abs(v) / velocity).max()),
-                float(np.sqrt((np.abs(a) / acceleration).max())),
-                float(np.cbrt((np.abs(np.diff(a, axis=0)) / (step * jerk)).max())),
+            motion = Trajectory(robot.joint_names, *spline_rows(controls, step))
+            motion = within_limits(motion, robot, settings, 0.0)
+            motions.append(
+                slowed(
+                    motion,
+                    extra_slowdown(extra, motion.positions, motion.velocities, motion.accelerations),
+                )
             )
-            factor *= extra_slowdown(extra, q, v / factor, a / factor**2)
-            duration = factor * clock[-1]
-            shortest = min(shortest, duration)
-            if duration < shortest_duration:
-                shortest_duration = duration
-                best = Trajectory(robot.joint_names, factor * clock, q, v / factor, a / factor**2)
-        if shortest > shortest_duration:
+        fastest = min(motions, key=lambda motion: motion.duration)
+        if best is not None and fastest.duration > best.duration:
             break
+        best = fastest
     assert best is not None
     return best

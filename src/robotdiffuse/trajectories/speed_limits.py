@@ -1,7 +1,7 @@
 """Timing of one polyline with rounded corners: its limits, its fastest speeds, and the rows of the motion."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -9,11 +9,20 @@ from numpy import ndarray
 
 from robotdiffuse.core.deadline import check_timing
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Settings
-from robotdiffuse.core.types import Configurations, JointRows, JointValues, Rows, Values, spline_rows
+from robotdiffuse.core.types import (
+    Configurations,
+    JointRows,
+    JointValues,
+    Rows,
+    Trajectory,
+    Values,
+    spline_rows,
+)
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories import timing_kernel
 from robotdiffuse.trajectories.timing_kernel import (
+    ROUNDING_MARGIN,
     RoundedLine,
     fastest_speeds,
     line_with_widths,
@@ -171,6 +180,30 @@ def time_line(
     # A motion within the extra limits may exceed them slightly after the averaging.
     slower = extra_slowdown(extra, q, v, a)
     return times * slower, q, v / slower, a / slower**2
+
+
+def slowed(motion: Trajectory, factor: float) -> Trajectory:
+    """The motion with all times multiplied by a factor."""
+    return replace(
+        motion,
+        times=factor * motion.times,
+        velocities=motion.velocities / factor,
+        accelerations=motion.accelerations / factor**2,
+    )
+
+
+def within_limits(
+    motion: Trajectory, robot: Robot, settings: TimingSettings, least: float = 1.0
+) -> Trajectory:
+    """The motion with all times multiplied by the smallest factor, at least `least`, with which the limits of
+    velocity, acceleration and jerk hold."""
+    velocity, acceleration = scaled_limits(robot, settings)
+    factor = max(
+        (np.abs(motion.velocities) / velocity).max(),
+        np.sqrt((np.abs(motion.accelerations) / acceleration).max()),
+        np.cbrt((motion.peak_jerks / jerk_limits(robot, settings)).max()),
+    )
+    return slowed(motion, max(ROUNDING_MARGIN * factor, least))
 
 
 def jerk_limits(robot: Robot, settings: TimingSettings = DEFAULT) -> JointValues:
@@ -337,10 +370,8 @@ def derivatives_and_limits(
         q = line(grid, 0)
         still = 0 * first
         gravity = torques(q, still, still)
-        low = -limits - gravity
-        high = limits - gravity
-        low = np.minimum(low, -MIN_TORQUE_SHARE * limits)
-        high = np.maximum(high, MIN_TORQUE_SHARE * limits)
+        low = np.minimum(-limits - gravity, -MIN_TORQUE_SHARE * limits)
+        high = np.maximum(limits - gravity, MIN_TORQUE_SHARE * limits)
         a = torques(q, still, first) - gravity
         b = torques(q, first, second) - gravity
         no_limit = np.full(len(limits), np.inf)

@@ -11,7 +11,15 @@ from jaxtyping import Int
 from numpy import ndarray
 
 from robotdiffuse.core.errors import MIN_RATE, InputError
-from robotdiffuse.core.types import Configurations, JointValues, Path, Trajectory, Values, interpolated
+from robotdiffuse.core.types import (
+    Configurations,
+    JointValues,
+    Path,
+    Trajectory,
+    Values,
+    interpolated,
+    spline_rows,
+)
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.speed_limits import (
     DEFAULT,
@@ -22,6 +30,7 @@ from robotdiffuse.trajectories.speed_limits import (
     TimingSettings,
     TooFastError,
     time_line,
+    within_limits,
 )
 from robotdiffuse.trajectories.timing_kernel import line_with_widths, rounded_line
 
@@ -95,7 +104,7 @@ def time_parameterize(
 
     Returns:
         The motion and its corners. Times start at 0 and strictly increase; the first and the last row are
-        exactly the first and the last waypoint. A path of length zero becomes two equal rows at rest.
+        exactly the first and the last waypoint. A path of length zero becomes equal rows at rest.
 
     Raises:
         InputError: If a velocity or acceleration limit of a joint is below MIN_RATE.
@@ -106,10 +115,9 @@ def time_parameterize(
     rows = _distinct(path.positions)
     waypoints = path.positions[rows]
     if len(rows) == 1:
-        still = np.zeros((2, robot.dof))
-        times = np.array([0.0, settings.sample_time])
-        resting = Trajectory(path.joint_names, times, path.positions[[0, -1]], still, still)
-        return Timing(waypoints, np.zeros(0), resting)
+        rows = spline_rows(path.positions[[0, -1]], settings.sample_time)
+        short = within_limits(Trajectory(path.joint_names, *rows), robot, settings)
+        return Timing(waypoints, np.zeros(0), short)
     allowed = np.full(len(rows), settings.corner_deviation) if deviations is None else deviations[rows]
     allowed[np.searchsorted(rows, stops, side="right") - 1] = 0.0
     deviations = _shrunk(waypoints, allowed[1:-1], keeps, MIN_DEVIATION)
@@ -121,14 +129,19 @@ def time_parameterize(
         except TooFastError:
             deviations[:1] = _smaller(deviations[:1])
     slower = settings
-    for attempt in range(MAX_TIMINGS):
+    attempt = 0
+    while True:
+        attempt += 1
         trajectory = _time_segments(robot, path, waypoints, deviations, slower, start_speed, extra)
         if not deviations.any() or valid(trajectory):
             return Timing(waypoints, deviations, trajectory)
         less = _shrunk(waypoints, deviations, lambda corner: free(replace(path, positions=corner)))
-        if (less < deviations).any():
+        if attempt == MAX_TIMINGS:
+            deviations = np.zeros_like(deviations)
+            slower = settings
+        elif (less < deviations).any():
             deviations = less
-        elif attempt < MAX_SLOWER_TIMINGS and not start_speed:
+        elif attempt <= MAX_SLOWER_TIMINGS and not start_speed:
             # To obey the jerk limits, positions are averaged over a window of time, which cuts corners. The
             # cut grows with the acceleration and the square of the window, and the window grows with the
             # acceleration. So half the acceleration cuts an eighth as far.
@@ -137,9 +150,6 @@ def time_parameterize(
         else:  # the refusal may come from any corner: round all of them less
             deviations = _smaller(deviations)
             slower = settings
-    deviations = np.zeros(len(waypoints) - 2)
-    trajectory = _time_segments(robot, path, waypoints, deviations, settings, start_speed, extra)
-    return Timing(waypoints, deviations, trajectory)
 
 
 def _smaller(deviations: Values) -> Values:
@@ -283,7 +293,7 @@ class StopGraph:
         """Values of s of all stops, in order: both ends, every sharp corner, and PATH_PARTS - 1 places
         between the ends, moved out of rounded corners and dropped if near another stop."""
         line = self.line
-        length = self.line.length
+        length = line.length
         corners = line.knots[1:-1]
         widths = line.half_widths
         stops = [0.0, *corners[deviations == 0], length]

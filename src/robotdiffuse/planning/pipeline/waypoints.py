@@ -18,6 +18,7 @@ rounded if it is free, so that the arm need not stop there.
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ from robotdiffuse.planning.context import (
 from robotdiffuse.problems.constraints import CartesianLine
 from robotdiffuse.problems.problem import Goal, JointGoal, Problem
 from robotdiffuse.trajectories.speed_limits import DEFAULT as TIMING
-from robotdiffuse.trajectories.speed_limits import stopping_distance
+from robotdiffuse.trajectories.speed_limits import stopping_distance, within_limits
 from robotdiffuse.trajectories.timing import joined_rows
 from robotdiffuse.trajectories.timing_kernel import rounded_line
 from robotdiffuse.validation.tolerances import DEFAULT, goal_error
@@ -216,7 +217,9 @@ def join(
             stop: [m] for a pose, [rad] for a configuration; 0: it stops there. It must be 0 if the motions
             have different path constraints, or Cartesian lines.
         time_limit: Wall time of the call [s].
-        request: Further arguments of `rd.plan` for rounding corners: clearance, velocity_scaling, ...
+        request: Further arguments of `rd.plan`: clearance, velocity_scaling, ... A rounded corner is timed
+            anew with the limits of this call, as are the motions that meet there; give the scalings again
+            that the motions were planned with.
 
     Returns:
         A result whose problem has the goals of all motions but the last as waypoints; or a result that says
@@ -249,15 +252,14 @@ def join(
         if all(constraint in problem.constraints for problem in problems)
         and not isinstance(constraint, CartesianLine)
     ]
+    shared_by_all = attrgetter(
+        "robot", "scene.shapes", "scene.allowed_contacts", "moving", "views", "payload"
+    )
     for i, (before, after) in enumerate(pairwise(results), 1):
-        scene = after.problem.scene
-        if (
-            after.problem.robot is not first.robot
-            or scene.shapes != first.scene.shapes
-            or scene.allowed_contacts != first.scene.allowed_contacts
-        ):
+        if shared_by_all(after.problem) != shared_by_all(first):
             raise InputError(
-                f"results[{i}] is for another robot or scene than results[0]: execute one after the other"
+                f"results[{i}] is for another robot, scene or payload than results[0]: execute one after "
+                "the other"
             )
         gap = np.abs(after.path.positions[0] - before.path.positions[-1])
         if gap.max() > DEFAULT.start_tolerance:
@@ -275,7 +277,12 @@ def join(
     goals = [problem.goal for problem in problems]
     problem = replace(first, waypoints=goals[:-1], blend=blend, goal=goals[-1], constraints=shared, notes=())
     context = PlanningContext(results[-1].planner, problem, PlanRequest(time_limit, **request))
-    return replace(_joined(context, results, _motions(context, results)), problem=problem)
+    limits = replace(context.timing, jerk=context.request.jerk or np.inf)
+    segments = [
+        replace(result, trajectory=within_limits(result.trajectory, first.robot, limits))
+        for result in results
+    ]
+    return replace(_joined(context, segments, _motions(context, segments)), problem=problem)
 
 
 def plan_from_start_velocity(planner: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
