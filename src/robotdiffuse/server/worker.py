@@ -21,7 +21,7 @@ from robotdiffuse.core.input_files import MEGABYTE, decoded, parse_json
 from robotdiffuse.core.settings import converted
 from robotdiffuse.core.types import RATES, Path, PlanResult, SampleRate, Trajectory, check_motion_arrays
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner
-from robotdiffuse.planning.context import PlanRequest
+from robotdiffuse.planning.context import PlanRequest, least_clearances
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.files import problem_from_record
 from robotdiffuse.problems.problem import Problem
@@ -200,8 +200,8 @@ def answer_plan(body: bytes) -> Answer:
     result: PlanResult = planner.plan(problem, **call_arguments)
     record = result.record()
     if rate is not None and result.trajectory is not None:
-        motion = _resampled(problem, result.trajectory, rate)
-        record |= motion.record() | {"duration": motion.duration}
+        motion, report = _resampled(problem, result.trajectory, rate)
+        record |= motion.record() | {"duration": motion.duration} | least_clearances(result, report)
     return _answer(record, result.status.value)
 
 
@@ -210,16 +210,18 @@ ARGUMENTS = ("planner", "rate", *CALL_ARGUMENTS)
 """Fields of a plan request besides its problem."""
 
 
-def _resampled(problem: Problem, trajectory: Trajectory, rate: float) -> Trajectory:
-    """The motion with rows at `rate` [Hz]. Raises InputError if the validator rejects it."""
+def _resampled(problem: Problem, trajectory: Trajectory, rate: float) -> tuple[Trajectory, Report]:
+    """The motion with rows at `rate` [Hz], and its report. Raises InputError if the validator rejects it."""
     if trajectory.duration * rate > MAX_ANSWER_ROWS:
         rows = f"for {trajectory.duration:.3g} s; an answer may have {MAX_ANSWER_ROWS} rows"
         raise InputError(f"rate is {rate:g} Hz {rows}")
     rows = trajectory.resample(rate)
-    violation = Verifier(problem).trajectory(rows).violation
-    if violation is not None:
-        raise InputError(f"rate is {rate:g} Hz; the motion with these rows is not valid: {violation.message}")
-    return rows
+    report = Verifier(problem).trajectory(rows)
+    if not report.valid:
+        raise InputError(
+            f"rate is {rate:g} Hz; the motion with these rows is not valid: {report.violation.message}"
+        )
+    return rows, report
 
 
 def _planner(name: object) -> Planner:
