@@ -162,6 +162,17 @@ def test_import_loads_nothing_heavy_and_public_names_resolve() -> None:
     assert python(code).stdout == "[]\nTrue True\n"
 
 
+def test_a_misspelt_public_name_is_answered_with_a_similar_one() -> None:
+    ended = python("import robotdiffuse as rd; rd.load_problems", status=1)
+    assert "no attribute 'load_problems'. Did you mean: 'load_problem'?" in ended.stderr
+
+
+def test_the_commands_work_without_docstrings() -> None:
+    """Regression: with PYTHONOPTIMIZE=2 every command was a KeyError."""
+    code = "from robotdiffuse import cli; cli.main(['planner', 'info', 'aorrtc'])"
+    assert "range" in python(code, PYTHONOPTIMIZE="2").stdout
+
+
 def test_a_plan_by_search_loads_what_it_needs_and_no_more(tmp_path: Path) -> None:
     """Loading further modules would take longer than planning."""
     problem = tmp_path / "problem.yaml"

@@ -44,3 +44,25 @@ def test_without_pytorch_all_but_its_planners_and_training_works() -> None:
     for name, line in zip(("mpnet", "mpinets"), said[7:9], strict=True):
         assert line == f'the planner {name} needs torch, not installed: pip install "robotdiffuse[train]"'
     assert said[9] == "2"
+
+
+WITHOUT_EXTRAS = """
+import inspect, sys
+sys.modules["torch"] = sys.modules["mcap"] = None  # importing them raises ImportError
+import robotdiffuse as rd
+from robotdiffuse import *
+print(set(rd.__all__) <= {name for name, _ in inspect.getmembers(rd)}, isinstance(rd.Scene(), RopDataset))
+for use in (lambda: RopDataset("rop"), lambda: read_depth_views("views.mcap", rd.load_robot("panda"))):
+    try:
+        use()
+    except rd.InputError as error:
+        print(error)
+"""
+
+
+def test_names_that_need_an_extra_are_there_without_it_and_say_so_when_they_are_called() -> None:
+    """Regression: `from robotdiffuse import *` and `help(robotdiffuse)` raised in a core install."""
+    said = python(WITHOUT_EXTRAS).stdout.splitlines()
+    assert said[0] == "True False"
+    assert said[1] == 'rd.RopDataset: this needs torch, not installed: pip install "robotdiffuse[train]"'
+    assert said[2].startswith("rd.read_depth_views: this needs mcap, ")

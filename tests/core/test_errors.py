@@ -1,9 +1,18 @@
 """The words of messages."""
 
-from robotdiffuse.core.errors import counted
+import pytest
+
+from robotdiffuse.core.errors import InputError, counted, needs
 
 
 def test_a_count_of_one_is_singular() -> None:
     """Regression: "1 problems", "1 workers"."""
     assert [counted(count, "entry", "entries") for count in (0, 1, 2000)] == ["0 entries", "1 entry", "2,000 entries"]
     assert [counted(count, "worker") for count in (1, "ray")] == ["1 worker", "ray workers"]
+
+
+def test_a_package_that_is_installed_but_broken_is_not_called_missing() -> None:
+    with pytest.raises(InputError, match=r"this needs OMPL, libboost\.so: not found: pip install"), needs("OMPL", "baselines"):
+        raise ImportError("libboost.so: not found")
+    with pytest.raises(InputError, match="this needs OMPL, not installed"), needs("OMPL", "baselines"):
+        raise ModuleNotFoundError("No module named 'ompl'")

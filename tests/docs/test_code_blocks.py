@@ -60,14 +60,37 @@ def test_a_page_that_starts_processes_runs_as_one_script(tmp_path: Path) -> None
         assert sum(line.startswith("solved ") for line in done.stdout.splitlines()) >= 2, done.stdout
 
 
-def test_code_of_pages_passes_the_type_checker(tmp_path: Path) -> None:
-    """In one run, since each checks the package first."""
+ARGUMENTS = """
+import numpy as np
+import robotdiffuse as rd
+
+ball = rd.Sphere([0, 0, 1], 0.1)
+tube = rd.Capsule((0, 0, 1), 0.1, 0.2, wxyz=np.ones(4))
+middle: np.ndarray = rd.Cylinder([0, 0, 0], 0.1, 0.2).center + tube.center
+meshes = (rd.Box(middle, [1, 1, 1]), rd.Mesh(np.zeros((4, 3)), np.zeros((4, 3), int), xyz=[0, 0, 1]))
+clouds = (rd.PointCloud(np.zeros((5, 3), np.float32)), rd.HeightMap([[0.0, 0.1], [0.2, 0.3]], 0.1))
+carried = rd.Payload(1.0, [0, 0, 0.1])
+moving = rd.MovingObstacle(ball, times=[0, 1], poses=[np.eye(4), np.eye(4)])
+goal = rd.AnyGoal((rd.JointGoal([[0.0] * 7]), rd.PoseGoal("hand", np.eye(4).tolist(), xyz_tolerance=[0.1, 0.1, 0.1])))
+region = (rd.PositionBox("hand", [0, 0, 0], [1, 1, 1]), rd.AxisCone("hand", [0, 0, 1], [0, 0, -1], 0.1))
+surface = (rd.OnPlane("hand", [0, 0, 0], [0, 0, 1], 0.01), rd.OnLine("hand", [0, 0, 0], [0, 0, 1], 0.01))
+planned = rd.load_planner("rrt_connect").plan(rd.load_problem("ball.yaml"))
+"""
+
+
+@pytest.mark.parametrize("checker", ["pyright", "mypy"])
+def test_code_of_pages_passes_the_type_checkers(checker: str, tmp_path: Path) -> None:
+    """In one run, since each checks the package first. Regression: for mypy, `rd.Sphere([0, 0, 1], 0.1)` was an error."""
+    pytest.importorskip(checker)
     for name in ("README", "docs/quick_start", "docs/how_to/plan"):
         (tmp_path / f"{Path(name).name}_page.py").write_text(script(ROOT / f"{name}.md"), encoding="utf-8")
+    (tmp_path / "arguments.py").write_text(ARGUMENTS)
     settings = {"extraPaths": [str(ROOT / "src")], "typeCheckingMode": "basic", "pythonVersion": "3.11"}
     (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))
-    command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    options = {"pyright": ("--pythonpath", sys.executable), "mypy": ("--strict", "--follow-imports=silent", ".")}
+    command = [sys.executable, "-m", checker, *options[checker]]
+    paths = os.environ | {"MYPYPATH": str(ROOT / "src")}
+    done = subprocess.run(command, cwd=tmp_path, env=paths, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
 
 

@@ -34,7 +34,8 @@ _DESCRIPTIONS = described_arguments()
 REQUEST = tuple(
     (
         f"--{name.replace('_', '-')} {name.upper()}",
-        _DESCRIPTIONS[name].replace("None:", "Default:")
+        # `python -OO` leaves docstrings out
+        _DESCRIPTIONS.get(name, "").replace("None:", "Default:")
         + ("" if argument.default is None else f" Default: {argument.default}."),
     )
     for name, argument in signature(plan).parameters.items()

@@ -51,6 +51,10 @@ class OutputError(InputError):
     """Output that could not be written, as on a full disk. The command line exits with status 3."""
 
 
+class MissingPackageError(InputError):
+    """An optional dependency that is not installed, or that cannot be imported."""
+
+
 @contextmanager
 def located(where: object) -> Iterator[None]:
     """Within the block, `where: ` is put before the message of an InputError, unless the message begins with
@@ -78,13 +82,14 @@ def reading(file: object) -> Iterator[None]:
 
 @contextmanager
 def needs(package: str, extra: str) -> Iterator[None]:
-    """Within the block, an ImportError becomes an InputError that names the package and the optional
+    """Within the block, an ImportError becomes a MissingPackageError that names the package and the optional
     dependencies (`robotdiffuse[extra]`) to install."""
     try:
         yield
-    except ImportError:
-        text = f'this needs {package}, not installed: pip install "robotdiffuse[{extra}]"'
-        raise InputError(text) from None
+    except ImportError as error:
+        why = "not installed" if isinstance(error, ModuleNotFoundError) else shortened(error)
+        text = f'this needs {package}, {why}: pip install "robotdiffuse[{extra}]"'
+        raise MissingPackageError(text) from None
 
 
 def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:

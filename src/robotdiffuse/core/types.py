@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from pathlib import Path as FilePath
 from types import FunctionType, NoneType
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar, dataclass_transform
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -146,6 +146,13 @@ def no_type_check(kind: type[T]) -> type[T]:
     return kind
 
 
+@dataclass_transform(eq_default=False, frozen_default=True, field_specifiers=(field,))
+def frozen_dataclass(kind: type[T]) -> type[T]:
+    """`dataclass(frozen=True, eq=False)`, of which mypy would not know that constructors take what can be set
+    to a field, such as a list for a GivenVector."""
+    return dataclass(frozen=True, eq=False)(kind)
+
+
 class Value:
     """Base of the dataclasses that are values: the arrays in their fields are read-only.
 
@@ -216,7 +223,7 @@ def _writable(array: ndarray) -> bool:
     return owner is not None and not isinstance(owner, bytes)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Path(Value):
     """Waypoints joined by straight segments in joint space."""
 
@@ -258,7 +265,7 @@ class State(NamedTuple):
     jerks: Float[ndarray, "*n dof"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Trajectory(Value):
     """Positions, velocities and accelerations over time.
 
@@ -550,7 +557,7 @@ NO_PROBLEM = "without its problem"
 REQUIRED = ("status", "reason", "planner", "robot", "joint_names", "planning_time", "verified", "seed")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class PlanResult:
     """The answer of a planner. `path` is set if and only if `status` is SOLVED; every such path has passed
     `verify`.
@@ -699,7 +706,7 @@ class PlanResult:
         return record if problem is None else record | {"problem": problem}
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class ResultFile:
     """Content of a result file."""
 

@@ -11,19 +11,18 @@ import numpy as np
 from jaxtyping import Float32, Int8
 from numpy import ndarray
 
-try:
-    import torch
-    from torch import Tensor
-    from torch.utils.data import Dataset, get_worker_info
-except ImportError:
-    raise ImportError('RopDataset needs torch, not installed: pip install "robotdiffuse[train]"') from None
-
-from robotdiffuse.core.errors import InputError, check_name
+from robotdiffuse.core.errors import InputError, check_name, needs
 from robotdiffuse.datasets.shards import SPLITS, read_manifest, read_rows
-from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.robots.kinematic_tree import JointNormalizer
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
+
+with needs("torch", "train"):
+    import torch
+    from torch import Tensor
+    from torch.utils.data import Dataset, get_worker_info
+
+    from robotdiffuse.datasets.surface_clouds import surface_clouds
 
 SHARDS_PER_BLOCK = 16
 """Number of shards whose rows are shuffled together. 16 shards of 500 rows are 57 MB of

@@ -30,7 +30,7 @@ from robotdiffuse.core.errors import (
 )
 from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import placed
-from robotdiffuse.core.types import Configuration, Points, Pose, Value, no_type_check
+from robotdiffuse.core.types import Configuration, Points, Pose, Value, frozen_dataclass, no_type_check
 from robotdiffuse.scenes.shapes import PointCloud
 
 INTEGER_NO_RETURN = 65535
@@ -50,7 +50,7 @@ MAX_CLOUD_HEIGHT = 240
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class DepthView(Value):
     """A depth image of a pinhole camera, in the frame of the robot's base.
 

@@ -4,7 +4,7 @@ import inspect
 import re
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.input_files import file_name
@@ -134,7 +134,7 @@ MAX_LOADED = 8
 """Largest number of planners with different settings that `plan` keeps loaded."""
 
 
-def load_planner(name: str, settings: object | None = None, weights: str | None = None) -> "Planner":
+def load_planner(name: str, settings: object | None = None, weights: str | None = None) -> "Planner[Any]":
     """Load a planner.
 
     Args:

@@ -5,14 +5,22 @@ Positions and directions are in the frame of the base, except where a field says
 As with shapes, the constructors check their arguments themselves: see `no_type_check` in scenes/shapes.py.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from types import NoneType
-from typing import Any, ClassVar, TypeVar, get_args, no_type_check
+from typing import Any, ClassVar, TypeVar, get_args
 
 import numpy as np
 
 from robotdiffuse.core.errors import MAX_COORDINATE, InputError, numbers, rigid_transform, shown, vector
-from robotdiffuse.core.types import GivenVector, Pose, PoseOrNone, Value, read_only
+from robotdiffuse.core.types import (
+    GivenVector,
+    Pose,
+    PoseOrNone,
+    Value,
+    frozen_dataclass,
+    no_type_check,
+    read_only,
+)
 
 # Smallest tolerances and angles that constraints may have [m], [rad].
 MIN_TOLERANCE = 1e-4
@@ -32,7 +40,7 @@ Self = TypeVar("Self", bound="FrameConstraint")
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class FrameConstraint(Value):
     """Base of all constraints."""
 
@@ -80,7 +88,7 @@ class FrameConstraint(Value):
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class AxisCone(FrameConstraint):
     """An axis of a link stays within an angle of a direction, e.g. to keep a cup upright."""
 
@@ -94,7 +102,7 @@ class AxisCone(FrameConstraint):
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class PositionBox(FrameConstraint):
     """The origin of a link stays in a box."""
 
@@ -116,7 +124,7 @@ class PositionBox(FrameConstraint):
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class OnPlane(FrameConstraint):
     """The origin of a link stays on a plane."""
 
@@ -130,7 +138,7 @@ class OnPlane(FrameConstraint):
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class OnLine(FrameConstraint):
     """The origin of a link stays on an infinite line."""
 
@@ -144,7 +152,7 @@ class OnLine(FrameConstraint):
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class CartesianLine(FrameConstraint):
     """The origin of a link moves on the straight segment from its start position to its goal position.
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from itertools import chain
 from pathlib import PurePath
-from typing import TYPE_CHECKING, Any, ClassVar, TypedDict, Unpack, no_type_check
+from typing import TYPE_CHECKING, Any, ClassVar, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,6 +42,8 @@ from robotdiffuse.core.types import (
     Value,
     Values,
     VectorOrNone,
+    frozen_dataclass,
+    no_type_check,
 )
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
 from robotdiffuse.problems.constraints import CONSTRAINTS, CartesianLine, Constraint
@@ -57,7 +59,7 @@ MAX_TURN = 3.2
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class JointGoal(Value):
     """A goal reached at any of several configurations."""
 
@@ -87,7 +89,7 @@ class JointGoal(Value):
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class PoseGoal(Value):
     """A pose of a link. Without tolerances, the path must end within 1 cm and 15 degrees of it, as in the
     paper.
@@ -142,7 +144,7 @@ class PoseGoal(Value):
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class PosesGoal(Value):
     """A pose for each of several links at once, e.g. for both hands of two arms, each with its tolerances."""
 
@@ -174,7 +176,7 @@ class PosesGoal(Value):
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class AnyGoal(Value):
     """Several goals, any of which may be reached. The goals of an AnyGoal among them become goals of this
     one."""
@@ -468,7 +470,7 @@ class StateValidity:
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Problem(Value):
     """A planning problem. Lengths in [m], angles in [rad], poses in the frame of the robot's base.
 

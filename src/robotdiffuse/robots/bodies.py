@@ -16,6 +16,7 @@ from robotdiffuse.core.types import (
     Rotation,
     Value,
     Vector,
+    frozen_dataclass,
     no_type_check,
     read_only,
 )
@@ -130,7 +131,7 @@ def inertia_of(values: ArrayLike) -> Inertia:
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Payload(EqualByContent):
     """A mass that a link carries; joint torques must support it in addition to the arm.
 

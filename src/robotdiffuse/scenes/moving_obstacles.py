@@ -3,7 +3,7 @@
 As with shapes, the constructor checks its arguments itself; scenes/shapes.py explains `no_type_check`.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -36,6 +36,7 @@ from robotdiffuse.core.types import (
     Values,
     VectorOrNone,
     check_increasing,
+    frozen_dataclass,
     no_type_check,
     read_only,
 )
@@ -54,7 +55,7 @@ POSE_TOLERANCE = 1e-6
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class MovingObstacle(Value):
     """A shape with its pose at time 0, in the frame of the robot's base, and one of three motions.
 

@@ -1,7 +1,6 @@
 """Scene: the static obstacles around a robot."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from dataclasses import replace as dataclass_replace
 from functools import cached_property
 from typing import Any
@@ -10,7 +9,7 @@ import numpy as np
 
 from robotdiffuse.core.errors import InputError, check_name, counted, joined, shown, unknown_name
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation, transform
-from robotdiffuse.core.types import Configuration, Pose, Value, no_type_check
+from robotdiffuse.core.types import Configuration, Pose, Value, frozen_dataclass, no_type_check
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 
@@ -28,7 +27,7 @@ PLANE_DEPTH = 0.1
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Scene(Value):
     """Obstacles in the frame of the robot's base.
 

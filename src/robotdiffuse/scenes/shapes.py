@@ -7,7 +7,7 @@ time; `no_type_check` turns this off for these classes, so that the constructors
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -39,6 +39,7 @@ from robotdiffuse.core.types import (
     Rotation,
     Value,
     Values,
+    frozen_dataclass,
     no_type_check,
     read_only,
 )
@@ -161,7 +162,7 @@ value. It returns the value to store, or raises InputError."""
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Sphere(Shape):
     """A ball.
 
@@ -222,7 +223,7 @@ class _Posed(Shape):
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Box(_Posed):
     """A box of any orientation.
 
@@ -250,7 +251,7 @@ class Box(_Posed):
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class _Axial(_Posed):
     """A shape that is symmetric about its own z axis."""
 
@@ -261,7 +262,7 @@ class _Axial(_Posed):
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Cylinder(_Axial):
     """A cylinder about its own z axis.
 
@@ -273,6 +274,8 @@ class Cylinder(_Axial):
         name: Name in results, commands and allowed contacts.
     """
 
+    center: GivenVector
+    wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     name: str = "cylinder"
     kind: ClassVar[str] = "cylinder"
 
@@ -288,7 +291,7 @@ class Cylinder(_Axial):
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Capsule(_Axial):
     """A cylinder about its own z axis with a half sphere at each end.
 
@@ -300,6 +303,8 @@ class Capsule(_Axial):
         name: Name in results, commands and allowed contacts.
     """
 
+    center: GivenVector
+    wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     name: str = "capsule"
     kind: ClassVar[str] = "capsule"
 
@@ -313,7 +318,7 @@ class Capsule(_Axial):
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class PointCloud(Shape):
     """A point cloud; each point is a small sphere. The cloud may be empty. `PointCloud.from_file` reads a
     file.
@@ -416,7 +421,7 @@ class Triangulated(Shape):
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Mesh(_Posed, Triangulated):
     """A triangle mesh. Only its surface is checked for collision, not the space inside. `Mesh.from_file`
     reads a file.
@@ -505,7 +510,7 @@ class Mesh(_Posed, Triangulated):
 
 
 @no_type_check
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class HeightMap(_Posed, Triangulated):
     """Terrain: heights at the points of a grid, joined by triangles. Only this surface is checked for
     collision.
