@@ -46,6 +46,14 @@ def test_grippers_and_hands_are_known_and_held(parts: str, tip: str, tmp_path: P
     assert robot.locked.keys() == {j.name for j in robot.joints if j.kind != "fixed"} - {*robot.joint_names}
 
 
+def test_a_word_that_all_joints_have_is_no_gripper(tmp_path: Path) -> None:
+    """Regression: of a finger with three joints on a table, only the first was planned."""
+    robot = read_urdf(written(tmp_path, chain("base", row("finger_", 3))))
+    assert robot.tip == "finger_3_link"
+    robot = read_urdf(written(tmp_path, chain("base", [*row("claw_", 4), "claw_jaw"])))
+    assert robot.tip == "claw_4_link"
+
+
 def test_a_joint_called_gripper_is_planned_if_the_tip_says_so(tmp_path: Path) -> None:
     robot = read_urdf(written(tmp_path, ARM, chain("j6_link", ["gripper"])), tip="gripper_link")
     assert robot.joint_names == (*row("j", 6), "gripper")

@@ -163,7 +163,8 @@ def read_srdf(file: str | Path) -> Srdf:
 
 
 GRIPPER = re.compile("grip|finger|jaw|claw|knuckle|thumb", re.IGNORECASE)
-"""Matches names of joints that count as gripper joints if few joints come after them."""
+"""Matches names of joints that count as gripper joints if few joints come after them. Words that the joint
+before has too do not count, since all joints of a robot may be called finger."""
 BOTH = "both"
 """Name of the group of all arms of a robot with two arms."""
 ALL = "all"
@@ -242,7 +243,7 @@ class JointTree:
             next_joints = [
                 j for j in self.below.get(link, []) if j.kind in MOVING_KINDS or j.child in self.roots
             ]
-            if chain and self._begins_gripper(next_joints, own_joints):
+            if chain and self._begins_gripper(next_joints, own_joints, chain[-1]):
                 return [Arm(chain, link, own_joints)]
             if len(next_joints) > 1:
                 branches = [self._arms_from(j.child, *self._extended(j, chain, 0)) for j in next_joints]
@@ -256,13 +257,14 @@ class JointTree:
         """A chain and its number of own joints, extended by a joint if the joint is movable."""
         return ((*chain, joint.name), own_joints + 1) if joint.kind in MOVING_KINDS else (chain, own_joints)
 
-    def _begins_gripper(self, branches: list[Joint], own_joints: int) -> bool:
+    def _begins_gripper(self, branches: list[Joint], own_joints: int, before: str) -> bool:
         """Whether `branches` begin a gripper or a hand; `own_joints` joints precede them since the last
-        branching."""
+        branching, and `before` is the last of these."""
         lengths = [self._chain_length(joint) for joint in branches]
         if len(branches) == 1:
-            jaw = branches[0].kind in MOVING_KINDS and GRIPPER.search(branches[0].name)
-            return bool(jaw) and lengths[0] <= MAX_HAND_FINGER_JOINTS
+            words = [len(GRIPPER.findall(name)) for name in (before, branches[0].name)]
+            jaw = branches[0].kind in MOVING_KINDS and words[0] < words[1]
+            return jaw and lengths[0] <= MAX_HAND_FINGER_JOINTS
         if len(branches) == 2:
             return max(lengths) <= MAX_FINGER_JOINTS
         hand = own_joints >= MIN_ARM_JOINTS and sum(length >= LIMB_JOINTS for length in lengths) not in (1, 2)

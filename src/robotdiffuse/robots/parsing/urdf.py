@@ -323,8 +323,7 @@ class UrdfTree:
         return elements
 
     def _end(self, name: str, element: ET.Element, what: str) -> str:
-        end = element.find(what)
-        link = "" if end is None else end.get("link", "")
+        link = _attributes(element, what).get("link", "")
         if link not in self.links:
             raise InputError(f"{self.path}: joint {name}: its {what} link {shown(link)} is not in the file")
         return link
@@ -382,21 +381,18 @@ class UrdfTree:
                 f"{self.path}: {location} has type {shown(kind)}; supported: {', '.join(KINDS)}; remove it "
                 f"with what it carries, or use --base {self.ends[name][1]} to plan only for what it carries"
             )
-        axis_element = element.find("axis")
         axis = np.array([1.0, 0.0, 0.0])
-        if axis_element is not None and kind != "fixed":
-            axis = self._numbers(axis_element.get("xyz", "1 0 0"), 3, f"{location}: axis")
+        if kind != "fixed":
+            axis = self._numbers(_attributes(element, "axis").get("xyz", "1 0 0"), 3, f"{location}: axis")
             if np.linalg.norm(axis) < 1e-6:
                 raise InputError(f"{self.path}: {location}: its axis is zero; give it a direction")
             axis = axis / np.linalg.norm(axis)
         joint = Joint(name, kind, *self.ends[name], self._origin(element, location), axis)
         if kind == "fixed":
             return joint
-        limit = element.find("limit")
-        joint = self._with_limits(replace(joint, mimic=self._mimic(name, element)), limit)
-        safety = element.find("safety_controller")
-        soft = {} if safety is None else safety.attrib
-        hard = {} if limit is None else limit.attrib
+        hard = _attributes(element, "limit")
+        joint = self._with_limits(replace(joint, mimic=self._mimic(name, element)), hard)
+        soft = _attributes(element, "safety_controller")
         soft_limits = [
             f"{end} {soft[f'soft_{end}_limit']}"
             for end in ("lower", "upper")
@@ -432,8 +428,7 @@ class UrdfTree:
         offset = self._numbers(followed.get("offset", "0"), 1, f"{location} offset")
         return Mimic(leaders[1], float(multiplier[0]), float(offset[0]))
 
-    def _with_limits(self, joint: Joint, limit: ET.Element | None) -> Joint:
-        attributes = {} if limit is None else limit.attrib
+    def _with_limits(self, joint: Joint, attributes: dict[str, str]) -> Joint:
         largest = {"lower": MAX_COORDINATE, "upper": MAX_COORDINATE, "velocity": MAX_RATE}
         if joint.kind == "continuous":  # its position limits are ignored
             largest = {"velocity": MAX_RATE}
@@ -474,12 +469,11 @@ class UrdfTree:
         with a note."""
         inertias = {}
         for link in links:
-            element = self.links[link].find("inertial")
-            mass = None if element is None else element.find("mass")
-            if element is None or mass is None or mass.get("value", "").strip() in ("0", "0.0"):
+            mass = self.links[link].find("inertial/mass")
+            if mass is None or mass.get("value", "").strip() in ("0", "0.0"):
                 continue
-            inertia = element.find("inertia")
-            attributes = {} if inertia is None else inertia.attrib
+            (element,) = self.links[link].findall("inertial")
+            attributes = _attributes(element, "inertia")
             try:
                 T = self._origin(element, link)
                 texts = (mass.get("value", ""), *(attributes.get(name, "") for name in MOMENTS))
@@ -600,19 +594,23 @@ class UrdfTree:
 
     def _origin(self, element: ET.Element, what: str) -> Pose:
         """The transform of the element's <origin>: T_link_element, or T_parent_joint of a joint."""
-        origin = element.find("origin")
-        if origin is None:
-            return np.eye(4)
+        origin = _attributes(element, "origin")
         xyz = self._numbers(origin.get("xyz", "0 0 0"), 3, f"{what}: origin xyz")
         quaternion = origin.get("quat_xyzw")
         if quaternion is None:
             rpy = self._numbers(origin.get("rpy", "0 0 0"), 3, f"{what}: origin rpy")
             return transform(xyz, rotation_from_rpy(*map(float, rpy)))
-        if "rpy" in origin.attrib:
+        if "rpy" in origin:
             raise InputError(f"{self.path}: {what}: origin has rpy and quat_xyzw; it must have one of them")
         numbers = self._numbers(quaternion, 4, f"{what}: origin quat_xyzw")
         x, y, z, w = unit_quaternion(f"{self.path}: {what}", numbers, "origin quat_xyzw")
         return transform(xyz, rotation_from_quaternion(np.array([w, x, y, z])))
+
+
+def _attributes(element: ET.Element, tag: str) -> dict[str, str]:
+    """Attributes of an element's child; none if there is no such child."""
+    child = element.find(tag)
+    return {} if child is None else child.attrib
 
 
 # FIELDS: MoveIt's fields of joint_limits.yaml, and those of `Joint`. FACTORS: MoveIt's fields that are
