@@ -76,6 +76,14 @@ def test_images_of_a_goal() -> None:
     assert (np.abs([nearest, first, last]) <= CONTINUOUS_LIMIT).all()
 
 
+def test_elbows_that_cannot_fold_through_reach_a_goal_on_the_other_side() -> None:
+    """Regression: if two elbows on continuous joints had to turn back by way of zero, no goal let both do so: no path."""
+    start = np.array([3.0, 1.0, 3.0])
+    rows = ARM.turned_both_ways(-start, start, ARM.continuous)
+    np.testing.assert_allclose(rows[[0, -1]], [[2 * np.pi - 3, -1.0, 2 * np.pi - 3], -start])
+    assert len(rows) == 4
+
+
 def test_limits_of_a_continuous_joint(tmp_path: FilePath) -> None:
     """Limits make it revolute, as the validator checks none of continuous ones; in robot folders it has those of planning."""
     assert rd.Problem(ARM, rd.Scene(), [50.0, 0.0, 0.0], [0.0, 0.0, 0.0]).start[0] == 50.0

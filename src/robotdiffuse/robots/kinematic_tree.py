@@ -252,7 +252,8 @@ class KinematicTree(Value):
         """Configurations within the limits that differ from `q` by whole turns of the masked joints.
 
         In the first row, each such joint is as close to `start` as possible. In each further row, one such
-        joint reaches `q` by turning in the other direction, since obstacles may block the short way.
+        joint reaches `q` by turning in the other direction, since obstacles may block the short way. In a
+        last row, several continuous joints do, and none of them passes half a turn, where elbows fold.
         """
         nearest = self._turned(q, start, joints)
         rows = [nearest]
@@ -261,6 +262,9 @@ class KinematicTree(Value):
             other_way[j] -= np.copysign(TURN, nearest[j] - start[j])
             if self.continuous[j] or self.lower[j] <= other_way[j] <= self.upper[j]:
                 rows.append(other_way)
+        turns = joints * self.whole_turns(nearest)
+        if np.count_nonzero(turns) > 1:
+            rows.append(nearest - turns)
         return np.stack(rows)
 
     def nearest_turns(self, q: Configurations, start: Configuration) -> Configurations:

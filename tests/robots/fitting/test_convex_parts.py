@@ -9,6 +9,7 @@ import trimesh
 from helpers.boxes import boxes, surface
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting import convex_parts
+from robotdiffuse.robots.fitting.triangles import split
 
 L = boxes(((0, 0, 0), (0.3, 0.1, 0.1)), ((0, 0, 0.1), (0.1, 0.1, 0.4)))
 FRAME = boxes(
@@ -93,3 +94,13 @@ def test_the_order_of_triangles_does_not_matter() -> None:
         for shape in (bowl, shuffled)
     )
     assert len(found) > 1 and np.allclose(found, other, atol=1e-6)
+
+
+def test_a_needle_is_split_into_as_many_pieces_as_it_is_long() -> None:
+    """Regression: halves of halves; a CAD mesh of 17,653 long triangles became 58 million pieces, which took 4 GB and 40 s."""
+    needle = np.array([[[0, 0, 0], [100.0, 0, 0], [100.0, 0.01, 0]]])
+    pieces = split(np.concatenate([needle, needle[:, [2, 0, 1]] + 1, needle[:, [0, 2, 1]] - 1]), 1.0)
+    assert len(pieces) < 3 * 210
+    assert np.linalg.norm(pieces - np.roll(pieces, 1, axis=1), axis=2).max() <= 1 + 1e-12
+    areas = np.linalg.norm(np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]), axis=1) / 2
+    assert areas.sum() == pytest.approx(3 * 0.5, rel=1e-9)

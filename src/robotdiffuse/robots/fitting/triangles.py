@@ -10,9 +10,10 @@ Triangles = Float[ndarray, "_ 3 3"]
 
 
 def split(triangles: Triangles, size: "float | Float[ndarray, 'n']", reach: float = np.inf) -> Triangles:
-    """Halve triangles at their longest edge until no edge is longer than `size` [m], a number or one per
-    triangle. A triangle is left out if its middle is farther from the origin than its longest edge plus
-    `reach` [m]."""
+    """Cut triangles in two at their longest edge until no edge is longer than `size` [m], a number or one per
+    triangle. The cut is in the middle of the edge. At a narrow end, as much as possible is cut off, since
+    halving cuts a needle into a number of pieces that grows with its length to the power of 1.6. A triangle
+    is left out if its middle is farther from the origin than its longest edge plus `reach` [m]."""
     sizes = np.broadcast_to(np.asarray(size, np.float64), len(triangles))
     return _split(np.ascontiguousarray(triangles, np.float64), sizes**2, reach)
 
@@ -22,19 +23,18 @@ def _split(triangles, squares, reach):
     count = len(triangles)
     out = np.concatenate((triangles, np.empty_like(triangles)))
     limits = np.concatenate((squares, squares))
+    edges = np.empty(3)  # squared lengths of the edges from each corner to the next
     t = 0
     while t < count:
-        longest_square = -1.0
-        k = 0
         middle_square = 0.0  # squared distance of the triangle's middle from the origin
         for i in range(3):
             square = 0.0
             middle_square += ((out[t, 0, i] + out[t, 1, i] + out[t, 2, i]) / 3) ** 2
             for d in range(3):
                 square += (out[t, i, d] - out[t, (i + 1) % 3, d]) ** 2
-            if square > longest_square:
-                longest_square = square
-                k = i
+            edges[i] = square
+        k = np.argmax(edges)
+        longest_square = edges[k]
         if np.sqrt(middle_square) > reach + np.sqrt(longest_square):
             # beyond reach: the last triangle takes its place
             count -= 1
@@ -47,12 +47,22 @@ def _split(triangles, squares, reach):
         if count == len(out):
             out = np.concatenate((out, np.empty_like(out)))
             limits = np.concatenate((limits, limits))
-        # one half in place of the triangle, the other one at the end
+        # where to cut the longest edge, as a fraction of it from its end beside the shortest edge
+        after = edges[(k + 1) % 3]
+        before = edges[(k + 2) % 3]
+        narrow = min(after, before)
+        middle = (narrow + longest_square - max(after, before)) / 2
+        longest = np.sqrt(longest_square)
+        at = max(middle / longest, np.sqrt(limits[t]) - np.sqrt(narrow)) / longest
+        if narrow > limits[t] or 4 * at * at * longest_square < limits[t]:
+            at = 0.5
+        at = min(at, 0.5) if before < after else 1 - min(at, 0.5)
+        # one piece in place of the triangle, the other one at the end
         out[count] = out[t]
         limits[count] = limits[t]
         for d in range(3):
-            middle = 0.5 * (out[t, k, d] + out[t, (k + 1) % 3, d])
-            out[t, (k + 1) % 3, d] = middle
-            out[count, k, d] = middle
+            cut = (1 - at) * out[t, k, d] + at * out[t, (k + 1) % 3, d]
+            out[t, (k + 1) % 3, d] = cut
+            out[count, k, d] = cut
         count += 1
     return out[:count].copy()
