@@ -59,6 +59,12 @@ def test_licenses_are_named(name: str) -> None:
     assert sum(file.stat().st_size for file in (DATA / name).iterdir()) < 1_000_000
 
 
+@pytest.mark.parametrize(("name", "most"), [("fr3", [10.0] * 7), ("gen3", [5.2] * 4 + [10.0] * 3)])
+def test_accelerations_are_those_that_the_maker_allows(name: str, most: list[float]) -> None:
+    """Regression: those of an FR3 were up to 21 rad/s², and its controller stops motions above 10 (Franka's specification)."""
+    assert (load_robot(name).acceleration <= np.array(most)).all()
+
+
 def test_joints_that_turn_twice_are_drawn_without_needless_turns() -> None:
     """Regression: shelf problems were unsolvable: start and goal differed by turns of a shoulder, which the floor blocks."""
     robot = load_robot("ur5e")
