@@ -105,7 +105,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     ),
     "a closed chain": (arm(ARM, joint("close", "base", "j4_link")), "two parent joints .*remove one"),
     "a link that is not there": (arm(ARM, joint("last", "j4_link", "hand")), "'hand'"),
-    "no limits": (arm(chain("base", ["j"], limits="")), "is revolute and has no .*lower"),
+    "no limits": (arm(chain("base", ["j"], limits="")), "j: no <limit lower= upper=>; add it"),
     "an endless motion": (text(robot(ARM).replace('velocity="2"', 'velocity="1e-300"')), "at least 1e-06"),
     "a vector of two numbers": (text(robot(ARM).replace('"0 0 0.1"', '"0 0"')), "origin xyz is '0 0'"),
     "no joint": (text(NOTHING), "no movable joint .*choose another --base or --tip"),

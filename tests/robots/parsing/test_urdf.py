@@ -249,6 +249,16 @@ def test_limits_of_continuous_joints_are_ignored(tmp_path: Path) -> None:
     assert read_urdf(written(tmp_path, parts)).upper == [CONTINUOUS_LIMIT]
 
 
+def test_a_wheel_without_limits_is_held_and_a_planned_joint_without_limits_is_refused(tmp_path: Path) -> None:
+    """Regression: Centauro was refused for the sake of its wheels, which no arm needs."""
+    wheel = [link("wheel"), joint("wheel_joint", "base", "wheel", limits="")]
+    file = written(tmp_path, *chain("base", row("j", 4)), *wheel)
+    assert read_urdf(file).joint_names == ("j1", "j2", "j3", "j4")
+    refuses("made.urdf: wheel_joint: no <limit lower= upper=>; add it", read_urdf, file, tip="wheel")
+    held = chain("base", ["j1"], limits=""), chain("j1_link", ["j2"])
+    assert read_urdf(written(tmp_path, *held), locked={"j1": 1.0}).joint_names == ("j2",)
+
+
 def test_soft_limits_are_noted(tmp_path: Path) -> None:
     soft = '<safety_controller k_velocity="20" soft_lower_limit="-1" soft_upper_limit="1"/>'
     [note] = read_urdf(written(tmp_path, chain("base", ["j"], more=soft))).notes

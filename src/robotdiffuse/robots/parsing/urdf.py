@@ -101,6 +101,8 @@ class UrdfTree:
     """Named poses and allowed pairs of a MuJoCo model."""
     unlimited: set[str] = field(default_factory=set)
     """Joints without a velocity limit."""
+    unranged: set[str] = field(default_factory=set)
+    """Joints without limits of position, such as wheels; they can be held at 0, but not planned."""
     _surfaces: dict[str, tuple[Surface, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -213,12 +215,17 @@ class UrdfTree:
         joints = self.below(base)
         names = [base, *(joint.child for joint in joints)]
         planned, ends = planned_joints(self.path, base, joints, tip, group, srdf)
+        limits = limits or {}
+        unranged = sorted(planned & self.unranged.difference(limits, locked or {}))
+        if unranged:
+            raise InputError(
+                f"{self.path}: {joined(unranged)}: no <limit lower= upper=>; add it, or hold them with --lock"
+            )
         meshes = self.geometry(names)
         inertias = self.inertias(names)
         notes = [
             f"joint {joint.name} is passive; it is held" for joint in joints if joint.name in srdf.passive
         ]
-        limits = limits or {}
         unlimited = [
             joint.name
             for joint in joints
@@ -440,9 +447,7 @@ class UrdfTree:
         if joint.kind == "continuous":
             limits |= {"lower": -CONTINUOUS_LIMIT, "upper": CONTINUOUS_LIMIT}
         if "lower" not in limits and "upper" not in limits:
-            raise InputError(
-                f"{self.path}: joint {joint.name} is {joint.kind} and has no <limit lower= upper=>"
-            )
+            self.unranged.add(joint.name)
         lower = limits.get("lower", 0.0)
         upper = limits.get("upper", 0.0)
         if lower > upper:
