@@ -14,7 +14,6 @@ from robotdiffuse.core.tables import Column, Table, show
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation
 from robotdiffuse.learning.weight_files import weights_for
 from robotdiffuse.robots import known_robots, load_robot
-from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import read_source
 
@@ -139,7 +138,10 @@ def _print_pairs(report: "AddReport") -> None:
 def print_robot(robot: Robot) -> None:
     """Print joints, limits, collision model and notes of a robot."""
     columns = ("joint", Column("kind", left=True), "lower", "upper", "velocity", "accel.", "jerk")
-    joints = [(j.name, j.kind, *_range(j), j.velocity, j.acceleration, j.jerk) for j in robot.planned_joints]
+    joints = []
+    for joint in robot.planned_joints:
+        limits = (None, None) if joint.kind == "continuous" else (joint.lower, joint.upper)
+        joints.append((joint.name, joint.kind, *limits, joint.velocity, joint.acceleration, joint.jerk))
     spheres = sum(map(len, robot.spheres.values()))
     meshes = sum(map(len, robot.meshes.values()))
     pairs = [("base, tip", f"{robot.base}, {robot.tip}")]
@@ -160,10 +162,6 @@ def print_robot(robot: Robot) -> None:
         *(("note", note) for note in robot.notes),
     ]
     show(Table.of(robot.name, columns, joints), Table.pairs("", pairs))
-
-
-def _range(joint: Joint) -> tuple[float | None, float | None]:
-    return (None, None) if joint.kind == "continuous" else (joint.lower, joint.upper)
 
 
 def _place(T: Float[ndarray, "4 4"]) -> str:

@@ -468,7 +468,7 @@ class Robot(KinematicTree):
             return ", ".join(f"{value:.4g}" for value in values)
 
         joints = ", ".join(self.joint_names)
-        spheres = sum(len(rows) for rows in self.spheres.values())
+        spheres = sum(map(len, self.spheres.values()))
         locked_text = ", ".join(f"{name} = {value:g}" for name, value in list(self.locked.items())[:6])
         more = f" and {len(self.locked) - 6} more" if len(self.locked) > 6 else ""
         lines = [

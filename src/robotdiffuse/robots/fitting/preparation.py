@@ -589,7 +589,7 @@ def add_robot(
     tree = UrdfTree(Path(urdf), packages or {}, compile_xacro=True)
     srdf_file = tree.srdf if srdf is None else Path(srdf)
     semantics = tree.semantics if srdf_file is None else read_srdf(srdf_file)
-    changed, notes = ({}, ()) if limits is None else read_limits(limits)
+    changed, limit_notes = ({}, ()) if limits is None else read_limits(limits)
     robot = tree.robot(base, tip, locked, group, semantics, changed)
     for pair in allow:
         for link in pair:
@@ -606,7 +606,8 @@ def add_robot(
     folder = user_robots() / name if out is None else Path(out)
     with lock_folder(folder):  # fails early if the folder cannot be written
         pass
-    robot = replace(robot, name=name, notes=(*robot.notes, *notes))
+    robot = replace(robot, name=name)
+    notes = [*robot.notes, *limit_notes]
     if not robot.meshes:
         raise InputError(
             f"{urdf}: no link has collision or visual geometry, so collisions cannot be checked; add "
@@ -633,11 +634,10 @@ def add_robot(
             if (a, b) not in checked and frozenset((a, b)) not in allowed and links.collide(poses, a, b, 0)
         ]
         if touching:
-            note = (
+            notes.append(
                 f"links that touch in all motions are not checked: {joined(touching)}; if joints between "
                 "them are held, --lock may hold them elsewhere"
             )
-            robot = replace(robot, notes=(*robot.notes, note))
     measured = prepared.false_collisions
     if measured.free == 0 or measured.by_spheres == 1:  # nothing can be planned
         shares = {pair.links: max(pair.colliding, pair.by_spheres) for pair in measured.pairs}
@@ -665,7 +665,7 @@ def add_robot(
         f"collide falsely in {measured.by_parts:.1%} of these, spheres in "
         f"{measured.by_spheres:.1%}"
     )
-    write_robot_folder(replace(prepared.robot, notes=(*robot.notes, note)), folder, source | fractions)
+    write_robot_folder(replace(prepared.robot, notes=(*notes, note)), folder, source | fractions)
     seconds = time.process_time() - begin
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_UNIT
     return AddReport(

@@ -690,8 +690,8 @@ def _fields(file: str, joint: str, entry: object) -> dict[str, float]:
         if entry.get(f"has_{kind}_limits") is False:
             continue
         max_value = MAX_COORDINATE if kind == "position" else MAX_RATE
-        number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-        if not number or abs(value) > max_value or (kind != "position" and value < MIN_RATE):
+        number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= max_value
+        if not number or (kind != "position" and value < MIN_RATE):
             rule = f"within ±{max_value:g}" if kind == "position" else f"from {MIN_RATE:g} to {max_value:g}"
             raise InputError(f"{file}: {key} of {joint} is {shown(value)}; it must be a number {rule}")
         fields[FIELDS[key]] = float(value)
