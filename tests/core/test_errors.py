@@ -1,7 +1,10 @@
 """The words of messages."""
 
 import pytest
+import torch
 
+import robotdiffuse as rd
+from helpers.refusals import refuses
 from robotdiffuse.core.errors import InputError, counted, needs
 
 
@@ -16,3 +19,8 @@ def test_a_package_that_is_installed_but_broken_is_not_called_missing() -> None:
         raise ImportError("libboost.so: not found")
     with pytest.raises(InputError, match="this needs OMPL, not installed"), needs("OMPL", "baselines"):
         raise ModuleNotFoundError("No module named 'ompl'")
+
+
+def test_a_tensor_with_gradients_is_refused_in_one_line() -> None:
+    """Regression: it was PyTorch's RuntimeError."""
+    refuses(r"box.center is .*requires_grad=True", rd.Box, torch.zeros(3, requires_grad=True), [1, 1, 1])
