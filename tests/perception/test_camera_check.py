@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 import robotdiffuse as rd
 from helpers.panda import HOME, PANDA
 from helpers.refusals import refuses
+from robotdiffuse.core.transforms import placed, pose, quaternion_from_rotation, transform
 from robotdiffuse.perception.camera_check import OPTICAL, agreement, camera_note
 from robotdiffuse.perception.depth_filter import pose_error
 from robotdiffuse.perception.depth_view import DepthNoise
@@ -77,6 +78,11 @@ MISTAKES = {
     "of the camera's body": lambda T: T @ np.linalg.inv(OPTICAL),
     "turned into the optical frame twice": lambda T: T @ OPTICAL,
     "as OpenGL": lambda T: T @ np.diag([1.0, -1, -1, 1]),
+    "has a transposed rotation": lambda T: transform(T[:3, 3], T[:3, :3].T),
+    "x y z w that was read as w x y z": lambda T: pose(T[:3, 3], wxyz=Rotation.from_matrix(T[:3, :3]).as_quat()),
+    "w x y z that was read as x y z w": lambda T: transform(
+        T[:3, 3], Rotation.from_quat(quaternion_from_rotation(T[:3, :3])).as_matrix()
+    ),
 }
 
 
@@ -87,6 +93,19 @@ def test_mistakes_in_poses_are_named(name: str) -> None:
     assert name in camera_note(wrong, PANDA, HOME)
     result = rd.load_planner("aorrtc").plan(rd.Problem(PANDA, rd.Scene([]), HOME, HOME + 0.1, views=[wrong]))
     assert any(name in note for note in result.notes)
+
+
+def test_a_cloud_in_the_frame_of_its_camera_or_in_millimeters_is_named() -> None:
+    """Regression: such clouds got no note; in millimeters, all space counted as seen free, with a confidence of 0.97."""
+    points = at_home().points()
+    for wrong, message in (
+        (placed(np.linalg.inv(T), points), "the cloud is in the camera's frame"),
+        (1000 * points, "its depths are about .*; they must be in meters"),
+    ):
+        view = rd.DepthView.from_cloud(wrong, T, HOME)
+        assert re.search(message, camera_note(view, PANDA, HOME)), message
+    assert camera_note(rd.DepthView.from_cloud(points, T, HOME), PANDA, HOME) == ""
+    refuses("they must be in meters", rd.Explorer(PANDA).observe, view)
 
 
 def test_intrinsics_of_another_image_and_a_calibration_that_is_off_are_named() -> None:

@@ -60,7 +60,9 @@ def test_what_is_refused() -> None:
         ({"intrinsics": (1.0, 1.0)}, "view.intrinsics is .* 4 finite numbers"),
         ({"intrinsics": {"fx": 1.0}}, r"view\.intrinsics has \['fx'\]; it must have fx, fy, cx, cy"),
         ({"intrinsics": [[460.0, 1, 319.5], [0, 461.0, 239.5], [0, 0, 1]]}, "without skew"),
-        ({"T_base_camera": 2 * np.eye(4)}, "it must be a homogeneous transform"),
+        ({"T_base_camera": 2 * np.eye(4)}, "the determinant 8 .* it must be a homogeneous transform"),
+        ({"T_base_camera": np.diag([1.0, -1.0, 1.0, 1.0])}, "the determinant -1 and the last row"),
+        ({"T_base_camera": T.T}, r"the last row \[1\."),
         ({"configuration": [np.nan]}, "view.configuration"),
         ({"range": "far"}, "view.range is 'far'; it must be a number"),
         ({"noise": 0.01}, "noise is 0.01; it must be what rd.measure_noise returns"),
@@ -75,6 +77,8 @@ def test_depth_files(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", image / 1000)
     np.savez(tmp_path / "a.npz", depth=image, other=image)
     np.save(tmp_path / "one.npy", image[:, :, None] / 1000)
+    np.save(tmp_path / "half.npy", np.array([[1.5]], np.float16))
+    assert read_depth(tmp_path / "half.npy") == 1.5, "without a warning of an overflow"
     for name in ("a.png", "a.npy", "a.npz", "one.npy"):
         assert np.allclose(read_depth(tmp_path / name), image / 1000)
     assert np.allclose(read_depth(tmp_path / "a.png", 0.0001), image / 10000)
@@ -179,6 +183,7 @@ def test_what_is_wrong_in_a_file(tmp_path: Path) -> None:
         Image.fromarray(np.full((6, 8), 1500, np.uint16)).save(tmp_path / f"{name}.png")
     (tmp_path / "b.json").write_text('{"K": [1.0, 2.0]}')
     (tmp_path / "c.json").write_text('{"fx": "wide", "fy": 1.0, "cx": 1.0, "cy": 1.0}')
+    np.save(tmp_path / "image.npy", np.ones((6, 8)))
     for entry, message in (
         ({"cloud": "a.ply", "camera": {}, "scale": 1}, r"unknown field of views\[0\]"),
         ({"cloud": "a.ply", "camera": CAMERA | {"xyz": [0, 0]}}, r"views\[0\]: camera.xyz"),
@@ -187,6 +192,8 @@ def test_what_is_wrong_in_a_file(tmp_path: Path) -> None:
         ({"depth": "a.png", "camera": CAMERA}, r"views\[0\] has no intrinsics"),
         ({"depth": "b.png", "camera": CAMERA}, "b.json holds no intrinsics"),
         ({"depth": "c.png", "camera": CAMERA}, "view.intrinsics is"),
+        ({"depth": "a.png", "camera": CAMERA, "intrinsics": "K.mat"}, "unknown intrinsics format of .*K.mat: '.mat'"),
+        ({"depth": "a.png", "camera": CAMERA, "intrinsics": "image.npy"}, "image.npy holds no intrinsics"),
     ):
         refuses(message, read_views, [entry], tmp_path)
 

@@ -1,5 +1,6 @@
 """Problem.is_free and clearance_at; notes on numbers that look like millimeters."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -99,6 +100,13 @@ def test_a_depth_image_in_millimeters_is_noted() -> None:
     assert "depths of views[0] begin at" in note and "millimeters" in note
     problem = rd.Problem(PANDA, rd.Scene(), HOME, TO, views=wrong, unknown="padded")
     assert rd.load_planner("aorrtc").plan(problem).notes.count(note) == 1
+
+
+def test_intrinsics_for_images_of_another_size_are_noted() -> None:
+    """Regression: without the arm in the image, nothing told that intrinsics were those before the image was resized."""
+    for factor in (0.5, 2.0):
+        [note] = _notes(views=[replace(seen(), intrinsics=tuple(factor * np.array(seen().intrinsics)))])
+        assert note.startswith("check the intrinsics of views[0]: cx and cy") and "(60, 80) pixels" in note
 
 
 def test_what_views_see_in_reach_is_no_scene_beyond_it() -> None:

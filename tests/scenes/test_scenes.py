@@ -228,6 +228,7 @@ PACKED = PCD.format(n=10**9, data="binary_compressed").encode() + struct.pack("<
         ("cloud.csv", b"t,x,y\n0,1,2\n", "has the columns .'t', 'x', 'y'.; it must have x, y and z"),
         ("cloud.npy", npy(POINTS + 1j), "holds complex128 of 50 x 3; it must be numbers"),
         ("cloud.npy", npy(POINTS > 0), "holds bool of 50 x 3; it must be numbers"),
+        ("cloud.npy", npy(np.ones((3, 5000))), "holds float64 of 3 x 5000; it must be numbers, n x 3"),
     ],
 )
 def test_wrong_point_files(name: str, content: bytes | None, message: str, tmp_path: Path) -> None:

@@ -318,9 +318,11 @@ def rigid_transform(what: str, value: object, slack: float = RIGID_SLACK) -> nda
         )
     rotation = T[:3, :3]
     off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(T[3] - LAST_ROW).max())
-    if off > slack or np.linalg.det(rotation) < 0:
+    handedness = np.linalg.det(rotation)
+    if off > slack or handedness < 0:
         raise InputError(
-            f"{what} is {shown(T)}; it must be a homogeneous transform: a rotation matrix, last row 0 0 0 1"
+            f"{what} is {shown(T)}, with the determinant {handedness:.3g} and the last row {shown(T[3])}; it"
+            " must be a homogeneous transform: a rotation matrix (determinant 1), last row 0 0 0 1"
         )
     T[3] = LAST_ROW
     return T

@@ -9,8 +9,9 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from robotdiffuse.core.errors import shown
+from robotdiffuse.core.transforms import placed, pose, quaternion_from_rotation
 from robotdiffuse.core.types import Configuration
-from robotdiffuse.perception.depth_view import FARTHEST, DepthView
+from robotdiffuse.perception.depth_view import FARTHEST, NEAREST, DepthView
 from robotdiffuse.perception.ray_caster import ray_cast
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -86,7 +87,10 @@ def implausible(view: DepthView) -> str:
     relative = np.abs(view.intrinsics) / (width, height, width, height)
     if view.cloud is None and (relative[:2].min() < MIN_FOCAL_FRACTION or relative.max() > MAX_INTRINSICS):
         return f"its intrinsics, {shown(view.intrinsics)}, do not fit an image of {width} x {height} pixels"
-    returns = view.depth[np.isfinite(view.depth) & (view.depth > 0)]
+    returns = view.depth
+    if view.cloud is not None:  # the image leaves out points behind the camera
+        returns = np.linalg.norm(view.cloud - view.T_base_camera[:3, 3], axis=1)
+    returns = returns[np.isfinite(returns) & (returns > 0)]
     middle = np.median(returns) if len(returns) else 0.0
     if middle <= FARTHEST:
         return ""
@@ -104,7 +108,14 @@ def contradiction(view: DepthView, robot: Robot, q: Configuration) -> str:
 def mistakes(view: DepthView) -> Iterator[tuple[str, DepthView]]:
     """Yields common mistakes, each as its description and the view with the mistake undone."""
     T = view.T_base_camera
+    cloud = view.cloud
+    if cloud is not None and cloud[:, 2].max() > NEAREST:
+        yield (
+            "the cloud is in the camera's frame; it must be in the frame of the base",
+            DepthView.from_cloud(placed(T, cloud), T),
+        )
     inverse = np.linalg.inv(T)
+    wxyz = quaternion_from_rotation(T[:3, :3])
     flipped = np.diag([1.0, -1.0, -1.0, 1.0])
     poses = {
         "T_base_camera is the inverse, T_camera_base": inverse,
@@ -114,8 +125,14 @@ def mistakes(view: DepthView) -> Iterator[tuple[str, DepthView]]:
         "T_base_camera is the inverse of the pose of the camera's body": inverse @ OPTICAL,
         "T_base_camera is an inverse, turned into the optical frame": np.linalg.inv(T @ OPTICAL.T),
     }
-    for name, pose in poses.items():
-        yield name, replace(view, T_base_camera=pose)
+    for name, quaternion in (
+        ("transposed rotation", wxyz * (1, -1, -1, -1)),
+        ("quaternion x y z w that was read as w x y z", np.roll(wxyz, 1)),
+        ("quaternion w x y z that was read as x y z w", np.roll(wxyz, -1)),
+    ):
+        poses[f"T_base_camera has a {name}"] = pose(T[:3, 3], wxyz=quaternion)
+    for name, other in poses.items():
+        yield name, replace(view, T_base_camera=other)
     fx, fy, cx, cy = view.intrinsics
     height, width = view.depth.shape
     center = (width - 1) / 2, (height - 1) / 2

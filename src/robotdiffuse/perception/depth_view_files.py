@@ -74,8 +74,8 @@ def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "
     integers = image.dtype.kind in "ui"
     if scale is None:
         scale = INTEGER_SCALE if integers else 1.0
-    depth = image.astype(np.float64) * positive("view", "scale", scale)
-    return np.where(integers & (image == INTEGER_NO_RETURN), 0.0, depth)
+    depth = image.astype(np.float64)
+    return np.where(integers & (depth == INTEGER_NO_RETURN), 0.0, depth * positive("view", "scale", scale))
 
 
 def _read_png(file: Path) -> ndarray:
@@ -114,13 +114,18 @@ def read_intrinsics(file: Path, size: tuple[int, ...]) -> Any:
     camera_info of ROS, intrinsics written by librealsense or Open3D, or fx, fy, cx and cy by name. Raises
     InputError for a file without intrinsics, and for one that states another size of the image.
     """
+    ending = known_ending(file, "intrinsics", (*INTRINSICS_FORMATS, ".yml"))
     input_file(file, "file of intrinsics")
-    if file.suffix.lower() == ".npy":
-        return read_arrays(file)[""]
-    if file.suffix.lower() == ".txt":
+    record: Any
+    if ending == ".npy":
+        record = read_arrays(file)[""]
+    elif ending == ".txt":
         with reading(file):
-            return np.loadtxt(file, max_rows=4)
-    record = read_json(file) if file.suffix.lower() == ".json" else read_yaml(file)
+            record = np.loadtxt(file, max_rows=4)
+    else:
+        record = read_json(file) if ending == ".json" else read_yaml(file)
+    if isinstance(record, ndarray) and record.shape in ((4,), (3, 3)):
+        return record
     if isinstance(record, dict):
         stated = tuple(record.get(name, record.get(f"image_{name}")) for name in ("height", "width"))
         if all(stated) and stated != size:

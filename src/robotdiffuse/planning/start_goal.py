@@ -464,5 +464,6 @@ def _explained(robot: Robot, scene: Scene, q: Configuration) -> str | None:
     """A message that says what collides at q, by `explain_collision`; None if the meshes are free."""
     message = _loaded("collision.exact_meshes").explain_collision(robot, scene, q)
     if message and any(isinstance(shape, SeenPoints) and shape.name in message for shape in scene.shapes):
-        return f"{message}; these points may be the arm's own: state the view's noise and pose_deviation"
+        advice = "state the view's configuration, noise and pose_deviation"
+        return f"{message}; these points may be the arm's own: {advice}"
     return message

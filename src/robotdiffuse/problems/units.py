@@ -15,6 +15,9 @@ MAX_EXTENT = 10.0
 """A mesh or a cloud gets a note if the longest edge of its bounding box exceeds this [m]; a view, if half of
 its depths exceed it. Other shapes get a note only if the shortest edge exceeds it: a floor is wide, but
 flat."""
+OFF_MIDDLE = 1.25
+"""A view gets a note if both cx and cy differ from half of the image's size by more than this factor, in the
+same direction."""
 VIEW_STRIDE = 4
 """Only every fourth row and column of a depth image is checked."""
 MIN_POINTS_IN_ARM = 10
@@ -27,27 +30,23 @@ def unit_notes(problem: Problem) -> tuple[str, ...]:
     too far away). If there is none, and no view or moving obstacle, one on all obstacles if none is in
     reach."""
     reach = reach_bound(problem.robot)
-    shapes = [shape for shape in problem.scene.shapes if not isinstance(shape, (SeenPoints, AssumedPoints))]
-    has_seen_points = len(shapes) < len(problem.scene.shapes)
+    given = [shape for shape in problem.scene.shapes if not isinstance(shape, (SeenPoints, AssumedPoints))]
+    shapes = [shape for shape in given if not isinstance(shape, PointCloud) or len(shape.points)]
     bounds = np.array([shape.bounds for shape in shapes]).reshape(-1, 2, 3)
     extents = bounds[:, 1] - bounds[:, 0]
-    large = np.flatnonzero(extents.max(axis=1) > MAX_EXTENT)
-    notes = [_size_note(shapes[i], extents[i]) for i in large]
-    notes += [_view_note(i, view, reach) for i, view in enumerate(problem.views)]
-    messages = tuple(note for note in notes if note)
-    solid = [
-        i for i, shape in enumerate(shapes) if not (isinstance(shape, PointCloud) and not len(shape.points))
-    ]
+    of_views = (_view_note(i, view, reach) for i, view in enumerate(problem.views))
+    messages = tuple(filter(None, (*map(_size_note, shapes, extents), *of_views)))
     # distances of the axis-aligned boxes from the origin [m]
-    distances = np.linalg.norm(np.maximum(bounds[solid, 0], -bounds[solid, 1]).clip(0.0), axis=1)
+    distances = np.linalg.norm(np.maximum(bounds[:, 0], -bounds[:, 1]).clip(0.0), axis=1)
     if (
         not messages
         and len(distances)
         and distances.min() > reach
-        and not (has_seen_points or problem.views or problem.moving)
+        and len(given) == len(problem.scene.shapes)
+        and not (problem.views or problem.moving)
     ):
         count = len(distances)
-        subject = f"all {count} obstacles are" if count > 1 else f"the obstacle {shapes[solid[0]].name} is"
+        subject = f"all {count} obstacles are" if count > 1 else f"the obstacle {shapes[0].name} is"
         distance_text = (
             f"beyond the arm's reach of {reach:.1f} m, at least {distances.min():.1f} m from its base"
         )
@@ -79,13 +78,19 @@ def _size_note(shape: Shape, extents: Vector) -> str:
 
 
 def _view_note(i: int, view: DepthView, reach: float) -> str:
+    middle = 2 * np.divide(view.intrinsics[2:], view.depth.shape[::-1])
+    if view.cloud is None and (middle.max() * OFF_MIDDLE < 1 or middle.min() > OFF_MIDDLE):
+        return (
+            f"check the intrinsics of views[{i}]: cx and cy, {view.intrinsics[2:]}, are far from the middle"
+            f" of its image of {view.depth.shape} pixels, h x w; are they for images of another size?"
+        )
     depths = view.depth[::VIEW_STRIDE, ::VIEW_STRIDE]
     depths = depths[np.isfinite(depths) & (depths > 0)]
     if not len(depths):
         return ""
-    nearest = float(depths.min())
-    middle = float(np.median(depths))
-    if middle <= MAX_EXTENT and nearest <= reach + float(np.linalg.norm(view.T_base_camera[:3, 3])):
+    nearest = depths.min()
+    half = np.median(depths)
+    if half <= MAX_EXTENT and nearest <= reach + np.linalg.norm(view.T_base_camera[:3, 3]):
         return ""
-    depths_are = f"depths of views[{i}] begin at {nearest:.4g} m, and half of them exceed {middle:.4g} m"
+    depths_are = f"depths of views[{i}] begin at {nearest:.4g} m, and half of them exceed {half:.4g} m"
     return f"check the units: the {depths_are}; {ADVICE}"

@@ -121,6 +121,8 @@ UTF8 = "utf-8-sig"
 """The encoding of texts, with or without a byte order mark."""
 POINT_RADIUS = 0.01
 """Default radius of points [m]."""
+MAX_COLUMNS = 1000
+"""Arrays with more columns hold points as columns, not as rows."""
 
 
 def voxel_thin(points: Points, voxel: float) -> Points:
@@ -177,7 +179,7 @@ def read_points(file: str | Path) -> tuple[Points, tuple[str, ...]]:
         points = np.asarray(reader(file))
     if points.size == 0:
         return np.zeros((0, 3)), (f"{file} holds no points",)
-    if points.dtype.kind not in "iuf" or points.ndim != 2 or points.shape[1] < 3:
+    if points.dtype.kind not in "iuf" or points.ndim != 2 or not 3 <= points.shape[1] <= MAX_COLUMNS:
         shape = " x ".join(map(str, points.shape))
         raise InputError(
             f"point cloud file {file} holds {points.dtype} of {shape}; it must be numbers, n x 3"

@@ -127,6 +127,15 @@ def test_assumptions_are_carved_free_at_the_ends() -> None:
     assert len(OccupiedVoxels("all", solid, PANDA, rd.Scene()).obstacles(ends[:1]).points) < 0.15 * solid.size
 
 
+def test_a_view_of_no_space_around_the_arm_is_noted(planner: Planner) -> None:
+    """Regression: nothing told that one of several cameras, with its position in millimeters, showed nothing."""
+    away = taken(DEEP).T_base_camera.copy()
+    away[:3, 3] *= 1000
+    views = taken(DEEP), replace(taken(DEEP), T_base_camera=away)
+    notes = unknown_space.plan_with_unknown_space(planner, partial("padded", *views), REQUEST).notes
+    assert [note[:8] for note in notes if "shows nothing" in note] == ["views[1]"]
+
+
 def test_images_without_returns_are_refused_unless_one_camera_sees(planner: Planner) -> None:
     """Regression: with a covered lens, the confidence was 0.995, without a note."""
     covered = [replace(taken(DEEP), depth=np.full((60, 80), depth)) for depth in (0.0, np.nan, np.inf, -1.0)]

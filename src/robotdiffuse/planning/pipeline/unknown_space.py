@@ -29,7 +29,7 @@ from robotdiffuse.core.types import FIRST, Configurations, PlanResult, Status
 from robotdiffuse.perception.camera_check import camera_note
 from robotdiffuse.perception.depth_filter import measured_share
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
-from robotdiffuse.perception.observed_volume import ObservedVolume, observe
+from robotdiffuse.perception.observed_volume import ObservedVolume, merged, observe
 from robotdiffuse.perception.unknown_space import (
     MAX_UNSEEN_SHARE,
     PADDINGS,
@@ -103,25 +103,33 @@ def plan_with_unknown_space(
     else:
         predict = None
     context = PlanningContext(planner.name, problem, request)
-    volume = None
+    views = problem.views if unknown is None else ()
+    volumes = [observe([view], problem.robot, problem.start) for view in views]
+    volume = merged(volumes)
     if unknown is None:
-        volume = observe(problem.views, problem.robot, problem.start)
         predicted = predict(volume) if predict is not None else predicted
         unknown = unknown_space_of(problem, volume, predicted)
     cameras = [camera_note(view, problem.robot, problem.start) for view in problem.views]
     prepared = context.elapsed
     shares = [measured_share(view) for view in problem.views]
     if shares and max(shares) < MIN_MEASURED_SHARE:
-        why = "the views measured nothing: hardly a pixel has a return; is the camera covered or broken?"
+        why = (
+            "the views measured nothing: hardly a depth is from 5 cm to 10 km; is the camera covered, or are"
+            " the depths, with their scale, not in meters?"
+        )
         return _with_notes(context, context.fail(Status.NO_PATH, why))
     for i, wrong in enumerate(cameras):
         if wrong:
             context.note(f"check the camera of views[{i}]: {wrong}")
+    for i, seen in enumerate(volumes):
+        if seen.unknown.all():
+            context.note(f"views[{i}] shows nothing of the space around the arm: check its T_base_camera")
     for i, share in enumerate(shares):
         if share < NOTED_SHARE:
+            remedy = "; if the sensor gives 0 where nothing is in range, state the view's range"
             context.note(
                 f"views[{i}]: {100 * (1 - share):.0f} % of the pixels measure nothing, which lowers the"
-                " confidence; if the sensor gives 0 where nothing is in range, state the view's range"
+                f" confidence{remedy if problem.views[i].cloud is None else ''}"
             )
     attempts = _Attempts(planner, context, unknown, UNSEEN_CONFIDENCE if any(cameras) else 1.0)
     as_seen = replace(problem, views=())
