@@ -105,6 +105,25 @@ def test_what_went_away_becomes_free_and_old_evidence_is_forgotten() -> None:
     assert not aging.occupied[middle]
 
 
+def test_what_appears_in_space_that_was_often_seen_free_is_there_at_once() -> None:
+    """Regression: what was seen free from two sides stayed free, and a motion went through what had just appeared."""
+    known = OccupancyMap(PANDA)
+    for bearing in (2.8, -1.4, 0.3, -0.9):
+        known.add(view_from(bearing, scene=rd.Scene([FLOOR])))
+    y, z = np.meshgrid(np.arange(0.21, 0.4, 0.02), np.arange(0.11, 0.31, 0.02))
+    front, behind = (np.column_stack([np.full(y.size, x), y.ravel(), z.ravel()]) for x in (0.451, 0.485))
+    assert MAP.hold(known.free, front).all() and MAP.hold(known.free, behind).all()
+    before = known.free
+    known.add(view_from(2.8))
+    assert MAP.hold(known.occupied, front).mean() > 0.9
+    assert MAP.hold(known.stale, behind).mean() > 0.9 and not MAP.hold(known.free, behind).any(), "only its front is seen"
+    assert (before & ~known.free & ~true(0.06)).sum() < 1e-3 * before.sum()
+    known.add_points(np.array([[0.3, -0.5, 0.4]]))
+    assert MAP.hold(known.occupied, np.array([[0.3, -0.5, 0.4]])).all(), "points without a sensor too"
+    known.add(view_from(2.8, scene=rd.Scene([FLOOR])))
+    assert MAP.hold(known.stale, behind).mean() < 0.1, "the arm hides some"
+
+
 def test_points_and_free_zones() -> None:
     known = OccupancyMap(PANDA)
     known.declare_free(((-0.3, -0.3, 0.0), (0.3, 0.3, 0.7)))

@@ -374,6 +374,23 @@ def test_certified_stops_before_a_ball_that_appears_are_free_in_the_true_scene(m
     assert explorer.stop(motion, 0.1) is None, "what was seen before the step is in its motion"
 
 
+@pytest.mark.parametrize("policy", ("strict", "probabilistic"))
+def test_the_motion_after_a_stop_avoids_what_appeared(policy: str) -> None:
+    """Regression: after two views of the empty space, the next motion went through the ball that had stopped the arm."""
+    settings = rd.ExplorerSettings(policy=policy, time_limit=1.0)
+    explorer = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), ((-0.4, -0.4, 0.0), (0.4, 0.4, 0.4)), settings)
+    camera = (300.0, 300.0, 159.5, 119.5), (320, 240), PANDA, FROM
+    around = np.arange(6) * np.pi / 3
+    poses = [looking_at(np.array([1.5 * np.cos(a), 1.5 * np.sin(a), 1.1]), np.array([0, 0, 0.4])) for a in around]
+    for T in poses:
+        explorer.observe(ray_cast(EMPTY.scene, T, *camera))
+    explorer.set_goal(TO)
+    true = replace(EMPTY, scene=rd.Scene([FLOOR, BALL]))
+    explorer.observe(ray_cast(true.scene, poses[5], *camera))
+    motion = explorer.next(FROM).motion
+    assert motion is None or rd.verify(replace(true, goal=motion.path.positions[-1]), motion.path).valid
+
+
 @pytest.mark.parametrize("share", (0.0, 0.3, 0.6, 0.95))
 def test_stops_keep_the_limits_and_begin_as_the_motion_was(motion: rd.Trajectory, share: float) -> None:
     time = float(share * motion.duration)

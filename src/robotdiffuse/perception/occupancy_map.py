@@ -26,7 +26,7 @@ from robotdiffuse.perception.observed_volume import (
     merged,
     observe,
 )
-from robotdiffuse.perception.seen_points import CELL, POINT_RADIUS, seen_points
+from robotdiffuse.perception.seen_points import CELL, END_SPREADS, POINT_RADIUS, seen_points
 from robotdiffuse.perception.voxel_grid import MAP, Voxels
 from robotdiffuse.robots.robot import Robot
 
@@ -40,6 +40,8 @@ MISS = np.float32(2.0)
 """A view that sees a whole voxel free subtracts this from the voxel's evidence."""
 MOST_EVIDENCE = np.float32(8.0)
 """Evidence is clipped to ± this, so that a few views suffice to change a voxel's state."""
+APPEARED_PADDING = 0.05
+"""Radius of points that appear in space that was free before [m]: only the front of their object is seen."""
 COVER_RADIUS = MAP.edge * 3**0.5 / 2
 """Radius of the ball around a voxel's center that covers the voxel [m]."""
 
@@ -71,6 +73,9 @@ class OccupancyMap:
         """Time of the last view that observed each voxel [s]; only used with a maximum age."""
         self._declared = np.zeros(MAP.shape, np.bool_)
         """See `declare_free`."""
+        self.stale = np.zeros(MAP.shape, np.bool_)
+        """Voxels seen free, but not since an object appeared within APPEARED_PADDING: they may be a part of
+        it."""
         self._now = -np.inf
         """Time of the latest view [s]."""
         self._known: tuple[Voxels, ...] | None = None
@@ -85,7 +90,8 @@ class OccupancyMap:
         """
         q = self.configuration_of(view)
         state, _, counts = carve_view(view, self.robot, q, MAP)
-        new_voxels = self._update(state, counts, stamp)
+        error = sum(view.pose_deviation) + END_SPREADS * filtered(view).spread  # at 1 m
+        new_voxels = self._update(state, counts, stamp, error)
         if any(view.pose_deviation):
             state, _, _ = carve_view(view, self.robot, q, MAP, narrowed=1.0)
         self._surely_free |= state == FREE
@@ -177,17 +183,35 @@ class OccupancyMap:
         return self._seen_at >= self._now - self.max_age
 
     def _update(
-        self, state: UInt8[ndarray, "nx ny nz"], counts: Int32[ndarray, "nx ny nz"], stamp: float
+        self,
+        state: UInt8[ndarray, "nx ny nz"],
+        counts: Int32[ndarray, "nx ny nz"],
+        stamp: float,
+        error: float = 0.0,
     ) -> int:
-        """Add a view's evidence for each voxel. Returns the number of voxels observed for the first time."""
+        """Add a view's evidence for each voxel. Returns the number of voxels observed for the first time.
+
+        error: points may be displaced by this [m], so that surfaces seem to appear next to where they are.
+        """
         self._now = max(self._now, stamp)
         self._known = None
         self._doubted[:] = False
         self._surely_free[counts > 0] = False
+        observed = (counts > 0) | (state == FREE)
         if self.max_age is not None:
             self._evidence[~self._fresh] = 0.0
             self._surely_free[~self._fresh] = False
-            self._seen_at[(counts > 0) | (state == FREE)] = stamp
+            self._seen_at[observed] = stamp
+        # an object that appears is there at once, however often its space was seen free before
+        free = self._evidence < 0
+        points = MAP.centers(np.argwhere((counts > 0) & free))
+        appeared = points[MAP.enclose(free, points, MAP.edge + error)]
+        self.stale &= ~observed
+        if len(appeared):
+            near = MAP.within(np.insert(appeared, 3, APPEARED_PADDING, axis=1)) & free & (state != FREE)
+            self._evidence[near] = 0.0
+            self._surely_free[near] = False
+            self.stale |= near
         return add_evidence(state, counts, self._evidence, HIT, MISS, MOST_EVIDENCE)
 
 

@@ -296,7 +296,7 @@ class Explorer:
         may_look = bool(self.cameras) and self._views_taken < self.settings.max_views
         limit = quick = self.settings.time_limit
         if may_look and policy == STRICT:  # a short search; a view may show more free space
-            quick = min(self._quick_limit * 2**self._views_taken, limit)
+            quick = min(QUICK_FRACTION * limit * 2**self._views_taken, limit)
         motion = self._motion(problem, policy, predicted, quick, may_look)
         if self._may_go(motion, policy):
             return self._go(motion, policy)
@@ -465,7 +465,7 @@ class Explorer:
         avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
         results = list[tuple[PlanResult, Voxels]]()
         for seed in range(self._seed, self._seed + TENTATIVE_MOTIONS):
-            result = self._planned(avoiding, self._quick_limit, seed)
+            result = self._planned(avoiding, QUICK_FRACTION * self.settings.time_limit, seed)
             if result.path is None and not any(earlier.solved for earlier, _ in results):
                 avoiding = as_seen
                 result = self._planned(as_seen, self.settings.time_limit, seed)
@@ -475,10 +475,6 @@ class Explorer:
                 break
         solved = [(result, unseen) for result, unseen in results if result.path is not None]
         return min(solved, key=lambda pair: int(pair[1].sum()), default=results[-1])
-
-    @property
-    def _quick_limit(self) -> float:
-        return QUICK_FRACTION * self.settings.time_limit
 
     def _motion(
         self,
@@ -577,4 +573,4 @@ class Explorer:
             return None
         below = ((0, 0), (0, 0), (LAYERS_BELOW, 0))
         probability = np.pad(predict(self._views.volume()), below, constant_values=PROBABILITY_BELOW)
-        return np.where(self.map.free, np.float32(0), probability)
+        return np.where(self.map.free, np.float32(0), np.maximum(probability, self.map.stale))

@@ -11,13 +11,12 @@ from functools import lru_cache
 from itertools import product
 
 import numpy as np
-from jaxtyping import Bool
-from numpy import ndarray
 from scipy.interpolate import BSpline
 
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.types import Path, Points, Trajectory
+from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.occupancy_map import APPEARED_PADDING
 from robotdiffuse.perception.seen_points import seen_shapes
 from robotdiffuse.perception.voxel_grid import MAP, Voxels
 from robotdiffuse.problems.problem import Problem
@@ -37,8 +36,6 @@ RAMPS = (0.1, 0.25, 0.5)
 """Fractions of the braking time that are tried for the rise of the deceleration, and for its fall."""
 LIMIT_TOLERANCE = 1e-3
 """Accelerations and jerks may exceed their limits by this fraction of the limit."""
-APPEARED_PADDING = 0.05
-"""Radius of points that appeared in space that was free before [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +75,7 @@ def stop_before(
     end = motion.positions[-1]
     seen = seen_shapes(views, robot, known, current, end[None])
     points = np.concatenate([np.zeros((0, 3)), *(shape.points for shape in seen)])
-    appeared = PointCloud(points[_within(points, free)], APPEARED_PADDING, name="appeared")
+    appeared = PointCloud(points[MAP.enclose(free, points, MAP.edge)], APPEARED_PADDING, name="appeared")
     validator = verifier(Problem(robot, known.with_shapes([*known.shapes, *seen, appeared]), current, end))
     remaining = np.concatenate([current[None], motion.positions[motion.times > time]])
     violation = validator.path(Path(robot.joint_names, remaining)).violation
@@ -87,15 +84,6 @@ def stop_before(
     stop = braked(robot, motion, time)
     certified = validator.collision_free(Path(robot.joint_names, stop.positions))
     return Stop(time, stop, violation.message, certified)
-
-
-def _within(points: Points, free: Voxels) -> Bool[ndarray, "n"]:
-    """Which points lie in free voxels with free voxels on all six sides."""
-    at = MAP.indices(points)
-    within = np.asarray(((at > 0) & (at < np.array(free.shape) - 1)).all(axis=1))
-    for side in ((0, 0, 0), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)):
-        within[within] = free[tuple((at[within] + side).T)]
-    return within
 
 
 def braked(robot: Robot, motion: Trajectory, time: float) -> Trajectory:
