@@ -276,4 +276,4 @@ def test_missing_transforms_are_said() -> None:
     refuses("no transforms connect camera", circle.at, "world", "camera", 5.0, "the image")
     bad = pose("base", "link", 5.0)
     bad["transform"]["rotation"] = dict.fromkeys("xyzw", 0.0)
-    refuses("the transform of link has the rotation", circle.add, bad, static=False)
+    refuses("transform of link.rotation is .* must not be zero", circle.add, bad, static=False)

@@ -21,7 +21,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
-from robotdiffuse.core.errors import InputError, check_list, check_type, reading
+from robotdiffuse.core.errors import InputError, check_list, check_type, reading, unit_quaternion
 from robotdiffuse.core.input_files import file_name
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
@@ -302,14 +302,8 @@ class TransformHistory:
         child = message["child_frame_id"].lstrip("/")
         place = message["transform"]["translation"]
         turn = message["transform"]["rotation"]
-        quaternion = np.array([turn[axis] for axis in "wxyz"])
-        length = np.linalg.norm(quaternion)
-        if not length > 0:
-            raise InputError(
-                f"the transform of {child} has the rotation {quaternion.tolist()}, which cannot be normalized"
-            )
-        rotation = rotation_from_quaternion(quaternion / length)
-        T = transform(np.array([place[axis] for axis in "xyz"]), rotation)
+        wxyz = unit_quaternion(f"transform of {child}", [turn[axis] for axis in "wxyz"], "rotation")
+        T = transform(np.array([place[axis] for axis in "xyz"]), rotation_from_quaternion(wxyz))
         self._parent[child] = message["header"]["frame_id"].lstrip("/")
         if static:
             self._static.add(child)

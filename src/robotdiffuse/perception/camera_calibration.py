@@ -159,8 +159,8 @@ def neighborhoods(points: Points, tree: KDTree, count: int) -> tuple[Points, Flo
 def _near_arm(view: DepthView, T: Pose, tree: KDTree) -> Points:
     """Points of an image that may be on the arm if the camera is at about T, in the camera's frame [m]."""
     stride = max(1, round(STEP_ANGLE * view.intrinsics[0] / 2))
-    fx, fy, cx, cy = (value / stride for value in view.intrinsics)
-    points = DepthView(view.depth[::stride, ::stride], (fx, fy, cx, cy), np.eye(4)).points()
+    intrinsics = np.divide(view.intrinsics, stride)
+    points = DepthView(view.depth[::stride, ::stride], intrinsics, np.eye(4)).points()
     distance, _ = tree.query(placed(T, points), distance_upper_bound=2 * GATES[0])
     points = points[np.isfinite(distance)]
     return points[:: max(1, len(points) // MAX_POINTS)]

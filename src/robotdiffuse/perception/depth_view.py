@@ -143,9 +143,7 @@ class DepthView(Value):
             return self.cloud
         v, u = np.nonzero(np.isfinite(self.depth) & (self.depth > 0))
         z = self.depth[v, u].astype(np.float64)
-        fx, fy, cx, cy = self.intrinsics
-        in_camera = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1)
-        return placed(self.T_base_camera, in_camera)
+        return placed(self.T_base_camera, unprojected(self, u, v, z))
 
     def moved(self, T: Pose) -> "DepthView":
         """Move the camera and the points.
@@ -208,6 +206,12 @@ class DepthView(Value):
         intrinsics = (1 / pixel, 1 / pixel, -low[0] / pixel, -low[1] / pixel)
         image = np.where(np.isfinite(depth), depth, 0.0).reshape(height, width)
         return cls(image, intrinsics, T, configuration, points, source)
+
+
+def unprojected(view: DepthView, u: ndarray, v: ndarray, z: ndarray) -> Points:
+    """The points at pixels u, v and depths z, in the camera's frame [m]."""
+    fx, fy, cx, cy = view.intrinsics
+    return np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1)
 
 
 def _four_intrinsics(given: object) -> object:

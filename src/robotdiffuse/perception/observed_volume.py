@@ -211,6 +211,18 @@ def _rectangle_minimum(table, v0, v1, u0, u1):
     return min_depth
 
 
+@kernel(fastmath=FASTMATH, inline="always")
+def _cells(middle, half, share):
+    """The first and last cell of an interval of pixels. share: cells per pixel."""
+    return int((middle - half + _HALF) * share), int((middle + half + _HALF) * share)
+
+
+@kernel(inline="always")
+def _rectangle_sum(sums, v0, v1, u0, u1):
+    """Sum of the cells of a rectangle with inclusive bounds, from a summed-area table."""
+    return sums[v1 + 1, u1 + 1] - sums[v0, u1 + 1] - sums[v1 + 1, u0] + sums[v0, u0]
+
+
 @kernel(fastmath=FASTMATH)
 def _count_points(depth, arm, intrinsics, T, low, voxel, counts):
     """Counts the image points in each voxel; `arm` says which pixels show the arm and do not count."""
@@ -366,13 +378,11 @@ def _state_of_block(first, intrinsics, T, low, voxel, errors, size, factor, tabl
     ):
         return OUT
     share = _ONE / np.float32(factor)
-    u0 = int((u - du + _HALF) * share)
-    u1 = int((u + du + _HALF) * share)
-    v0 = int((v - dv + _HALF) * share)
-    v1 = int((v + dv + _HALF) * share)
+    u0, u1 = _cells(u, du, share)
+    v0, v1 = _cells(v, dv, share)
     if u - du < -_HALF or v - dv < -_HALF or u1 >= table.shape[2] or v1 >= table.shape[1]:
         return -1
-    if missing[v1 + 1, u1 + 1] - missing[v0, u1 + 1] - missing[v1 + 1, u0] + missing[v0, u0]:
+    if _rectangle_sum(missing, v0, v1, u0, u1):
         return -1
     if far > errors[3]:
         return -1
@@ -425,18 +435,14 @@ def _carve_block(
                     own_share = du0 * dv0 / (du * dv)  # share of the rectangle that the voxel covers
                     du = fx * du / (z - ez)
                     dv = fy * dv / (z - ez)
-                    u0 = int((u - du + _HALF) * share)
-                    u1 = int((u + du + _HALF) * share)
-                    v0 = int((v - dv + _HALF) * share)
-                    v1 = int((v + dv + _HALF) * share)
+                    u0, u1 = _cells(u, du, share)
+                    v0, v1 = _cells(v, dv, share)
                     inside = u - du >= -_HALF and v - dv >= -_HALF and u1 < w and v1 < h
                     u0 = max(0, u0)
                     v0 = max(0, v0)
                     u1 = min(w - 1, u1)
                     v1 = min(h - 1, v1)
-                    lost = (
-                        missing[v1 + 1, u1 + 1] - missing[v0, u1 + 1] - missing[v1 + 1, u0] + missing[v0, u0]
-                    )
+                    lost = _rectangle_sum(missing, v0, v1, u0, u1)
                     pixels = np.float32((v1 + 1 - v0) * (u1 + 1 - u0) * factor * factor) * own_share
                     nearest = _rectangle_minimum(table, v0, v1, u0, u1)
                     if (

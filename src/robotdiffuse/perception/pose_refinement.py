@@ -20,7 +20,7 @@ from robotdiffuse.core.transforms import placed, transform
 from robotdiffuse.core.types import Configuration, Points, Pose, Values
 from robotdiffuse.perception.camera_calibration import arm_surface, neighborhoods
 from robotdiffuse.perception.depth_filter import filtered, grown_for_errors, pose_error
-from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.depth_view import DepthView, unprojected
 from robotdiffuse.perception.seen_points import ARM_DISTANCE, nearest_surfaces, sphere_distances
 from robotdiffuse.perception.voxel_grid import MAP
 from robotdiffuse.robots.robot import Robot
@@ -146,7 +146,7 @@ class PoseRefinement:
     def observe(self, view: DepthView) -> DepthView:
         """Take a view into account, and return it with its refined pose."""
         q = view.configuration
-        if not any(view.pose_deviation) or view.cloud is not None or q is None or len(q) != self._robot.dof:
+        if not any(view.pose_deviation) or view.cloud is not None or q is None:
             return view
         number = self._camera(view, q)
         earlier = [image for image in self._images if image.camera == number]
@@ -318,9 +318,8 @@ def _deviation(view: DepthView, T: Pose, covariance: Float[ndarray, "6 6"]) -> t
     bounds the other displacements, in proportion to the distance.
     """
     height, width = view.depth.shape
-    fx, fy, cx, cy = view.intrinsics
     u, v, z = (a.ravel() for a in np.meshgrid((0, width / 2, width), (0, height / 2, height), DEPTHS))
-    points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1)
+    points = unprojected(view, u, v, z)
     points = points[MAP.contains(MAP.indices(placed(T, points)))]
     if not len(points):
         return view.pose_deviation
@@ -348,9 +347,8 @@ def _block_points(view: DepthView) -> Points:
     ok = (count > 0.9 * size**2) & (depths.max(axis=(1, 3)) < SAME_SURFACE * nearest)
     v, u = np.nonzero(ok)
     z = depths.sum(axis=(1, 3))[ok].astype(np.float64) / count[ok]
-    fx, fy, cx, cy = view.intrinsics
     half = (size - 1) / 2
-    return np.stack([(size * u + half - cx) / fx * z, (size * v + half - cy) / fy * z, z], axis=1)
+    return unprojected(view, size * u + half, size * v + half, z)
 
 
 def _normals(points: Points) -> tuple[Points, Bool[ndarray, "n"]]:

@@ -28,7 +28,7 @@ from robotdiffuse.planning import plan
 from robotdiffuse.planning.context import PlanRequest, clock, time_left
 from robotdiffuse.planning.pipeline.waypoints import join, one_after_another
 from robotdiffuse.problems.constraints import CartesianLine, Constraint
-from robotdiffuse.problems.problem import AnyGoal, JointGoal, PoseGoal, Problem, StateValidity
+from robotdiffuse.problems.problem import AnyGoal, JointGoal, PoseGoal, Problem, StateValidity, goals_of
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Shape
@@ -272,7 +272,7 @@ def plan_steps(
 def _goal_ends(problem: Problem) -> list[tuple[int, Configuration]]:
     """Configurations at the goals of a problem, each with its goal index (see `PlanResult.goal_index`); none
     for poses with tolerances and for poses of several links."""
-    goals = problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
+    goals = goals_of(problem.goal)
     ends = list[tuple[int, Configuration]]()
     for i, goal in enumerate(goals):
         if isinstance(goal, PoseGoal) and not goal.tolerant:

@@ -187,8 +187,7 @@ class AnyGoal(Value):
     def __post_init__(self) -> None:
         types = "rd.JointGoal, rd.PoseGoal, rd.PosesGoal and rd.AnyGoal"
         check_list("goal.goals", self.goals, Goal, types, least=1)
-        goals = [goal.goals if isinstance(goal, AnyGoal) else (goal,) for goal in self.goals]
-        object.__setattr__(self, "goals", tuple(chain(*goals)))
+        object.__setattr__(self, "goals", tuple(chain(*map(goals_of, self.goals))))
 
     def moved(self, T: Pose) -> "AnyGoal":
         """Move all goals.
@@ -204,6 +203,11 @@ class AnyGoal(Value):
 
 OneGoal = JointGoal | PoseGoal | PosesGoal
 Goal = OneGoal | AnyGoal
+
+
+def goals_of(goal: Goal) -> "tuple[OneGoal, ...]":
+    """The alternative goals: one of them must be reached."""
+    return goal.goals if isinstance(goal, AnyGoal) else (goal,)
 
 
 def poses_of(goal: Goal) -> Sequence[PoseGoal]:

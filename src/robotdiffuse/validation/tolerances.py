@@ -11,7 +11,7 @@ from numpy import ndarray
 from robotdiffuse.core.settings import Bound, Natural, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import inverse, rotation_angle, rpy_from_rotation
 from robotdiffuse.core.types import Configuration, Configurations, JointRows, Pose, Values, interpolated
-from robotdiffuse.problems.problem import AnyGoal, Goal, JointGoal, PosesGoal
+from robotdiffuse.problems.problem import AnyGoal, Goal, JointGoal, PosesGoal, goals_of
 from robotdiffuse.robots.robot import Robot
 
 
@@ -148,7 +148,7 @@ def goal_error(
 def goal_index(robot: Robot, goal: Goal, q: Configuration) -> int | None:
     """Index of the goal that a configuration reaches, among the goals of an `AnyGoal` or the rows of several
     goal configurations; None if it reaches no goal. Goals that are reached exactly come before others."""
-    goals: Sequence[Goal] = goal.goals if isinstance(goal, AnyGoal) else (goal,)
+    goals: Sequence[Goal] = goals_of(goal)
     if isinstance(goal, JointGoal):
         goals = [JointGoal(row) for row in goal.positions]
     poses = dict[str, Pose]()

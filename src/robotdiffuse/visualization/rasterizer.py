@@ -4,6 +4,7 @@ on every machine."""
 import numpy as np
 
 from robotdiffuse.core.kernels import kernel
+from robotdiffuse.robots.frame_kernel import dot
 
 GROUND_RADIUS = 3.2
 """Radius of the visible ground [m]."""
@@ -20,11 +21,6 @@ BOUNCE_COLOR = 0.16, 0.15, 0.14
 def _row(rows, i):
     """The three numbers of a row."""
     return rows[i, 0], rows[i, 1], rows[i, 2]
-
-
-@kernel()
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @kernel()
@@ -82,14 +78,14 @@ def _lit(light, at, n, first):
     total = 0.0
     for k in range(first, maps.shape[0], 4):
         d = directions[k]
-        cosine = _dot(n, d[2])
+        cosine = dot(n, d[2])
         total += 1.0
         if cosine <= 0:
             continue
-        column = int(_dot(x, d[0]) * scale + 0.5 * size)
-        row = int(_dot(x, d[1]) * scale + 0.5 * size)
+        column = int(dot(x, d[0]) * scale + 0.5 * size)
+        row = int(dot(x, d[1]) * scale + 0.5 * size)
         # a texel of a surface that the light meets at a flat angle spans more depth
-        beyond = _dot(x, d[2]) + bias * min(4.0, 0.5 / cosine) + 100.0
+        beyond = dot(x, d[2]) + bias * min(4.0, 0.5 / cosine) + 100.0
         inside = 0 <= column < size and 0 <= row < size
         if not (inside and maps[k, row, column] > beyond):
             received += cosine
@@ -119,7 +115,7 @@ def _surface(row, column, near, seen, camera, height):
     ident, screen, faces, normals, _ = seen
     eye, rays = camera
     pixel = column + 0.5, row + 0.5, 1.0
-    ray = _dot(rays[0], pixel), _dot(rays[1], pixel), _dot(rays[2], pixel)
+    ray = dot(rays[0], pixel), dot(rays[1], pixel), dot(rays[2], pixel)
     no_weights = 0.0, 0.0, 0.0
     up = 0.0, 0.0, 1.0
     if ray[2] < 0 and eye[2] > height and ray[2] / (height - eye[2]) > near[row, column]:
@@ -138,8 +134,8 @@ def _surface(row, column, near, seen, camera, height):
     total = u + v + t
     weights = u / total, v / total, t / total
     n = _mixed(normals, (i, j, k), weights)
-    length = np.sqrt(_dot(n, n)) + 1e-9
-    if _dot(n, ray) > 0:
+    length = np.sqrt(dot(n, n)) + 1e-9
+    if dot(n, ray) > 0:
         length = -length
     return 1 / near[row, column], ray, (n[0] / length, n[1] / length, n[2] / length), weights, True
 
@@ -171,7 +167,7 @@ def shade(image, near, seen, camera, height, sky, key):
     for row in range(h):
         for column in range(w):
             depth, ray, n, weights, solid = _surface(row, column, near, seen, camera, height)
-            norm = np.sqrt(_dot(ray, ray))
+            norm = np.sqrt(dot(ray, ray))
             up = min(1.0, max(0.0, 0.5 + 1.1 * ray[2] / norm))
             for c in range(3):
                 image[row, column, c] = BACKGROUND[0][c] * up + BACKGROUND[1][c] * (1 - up)
@@ -192,8 +188,8 @@ def shade(image, near, seen, camera, height, sky, key):
                 base_color = _mixed(colors, _row(faces, ident[row, column]), weights)
                 # highlight of Blinn and Phong, by the half vector, and brighter edges
                 middle = toward[0] - ray[0] / norm, toward[1] - ray[1] / norm, toward[2] - ray[2] / norm
-                half = max(0.0, _dot(n, middle) / np.sqrt(_dot(middle, middle)))
-                edge = 1 + _dot(n, ray) / norm
+                half = max(0.0, dot(n, middle) / np.sqrt(dot(middle, middle)))
+                edge = 1 + dot(n, ray) / norm
                 gloss = 0.20 * min(1.0, 3 * q) * half**60 + 0.12 * s * edge**4
             else:
                 pixel = depth * np.hypot(rays[0, 0], rays[1, 0])
@@ -222,11 +218,11 @@ def blend_ghost(image, solid, near, seen, camera, toward, tint, alpha):
             if near[row, column] <= 1.003 * solid[row, column]:
                 continue
             _, ray, n, weights, _ = _surface(row, column, near, seen, camera, -np.inf)
-            facing = _dot(n, ray) / np.sqrt(_dot(ray, ray))
+            facing = dot(n, ray) / np.sqrt(dot(ray, ray))
             corners = _row(faces, ident[row, column])
             outward = _mixed(normals, corners, weights)  # n points to the eye
-            length = np.sqrt(_dot(outward, outward)) + 1e-9
-            bright = 0.62 + 0.38 * max(0.0, _dot(outward, toward) / length)
+            length = np.sqrt(dot(outward, outward)) + 1e-9
+            bright = 0.62 + 0.38 * max(0.0, dot(outward, toward) / length)
             cover = min(1.0, alpha * (0.7 + 1.1 * (1 - abs(facing)) ** 2))
             base_color = _mixed(colors, corners, weights)
             for c in range(3):

@@ -48,12 +48,11 @@ from robotdiffuse.drawables import (
 from robotdiffuse.planning.pose_goals import pose_configurations
 from robotdiffuse.problems.files import problem_from_record
 from robotdiffuse.problems.problem import (
-    AnyGoal,
     JointGoal,
-    OneGoal,
     Problem,
     StateValidity,
     check_problem,
+    goals_of,
     poses_of,
 )
 from robotdiffuse.robots.robot import Robot
@@ -299,7 +298,7 @@ def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | N
     scene = problem.scene.with_shapes([*problem.scene.shapes, *(moving.shape for moving in problem.moving)])
     robot, scene = replace(problem, scene=scene, moving=()).robot_and_scene_in_world()
     T_world_base = IDENTITY if problem.T_world_base is None else problem.T_world_base
-    poses = (pose for goal in _goals(problem) for pose in poses_of(goal))
+    poses = (pose for goal in goals_of(problem.goal) for pose in poses_of(goal))
     T_world_poses = [T_world_base @ pose.T_base_frame for pose in poses]
     near_poses = [Sphere(T[:3, 3], AXIS_LENGTH) for T in T_world_poses]
     framed = scene.with_shapes([*scene.shapes, *near_poses])  # the view includes goal poses
@@ -327,17 +326,12 @@ def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | N
     return write_atomically(target, page_text(title, data))
 
 
-def _goals(problem: Problem) -> Sequence[OneGoal]:
-    """The alternative goals of a problem: one of them must be reached."""
-    return problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
-
-
 def _goal_state(problem: Problem) -> tuple[Configuration | None, StateValidity]:
     """The first free goal configuration, or else the first goal configuration, and its validity; None and
     UNREACHED if no configuration that reaches the goal was found."""
     rng = np.random.default_rng(0)
     first = None
-    for goal in _goals(problem):
+    for goal in goals_of(problem.goal):
         joints = isinstance(goal, JointGoal)
         for q in goal.positions if joints else pose_configurations(problem, goal, rng):
             validity = problem.is_free(q)

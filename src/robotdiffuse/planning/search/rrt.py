@@ -47,7 +47,7 @@ from robotdiffuse.planning.search.time_optimization import (
     still_improves,
 )
 from robotdiffuse.planning.start_goal import StartGoal
-from robotdiffuse.problems.problem import AnyGoal, JointGoal
+from robotdiffuse.problems.problem import JointGoal, goals_of
 from robotdiffuse.trajectories.simplification import simplify, tighten
 from robotdiffuse.trajectories.speed_limits import scaled_limits
 
@@ -664,7 +664,7 @@ def anytime(
     request = context.request
     problem = context.problem
     if request.objective == TIME and request.until != FIRST and not problem.constraints:
-        goals = problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
+        goals = goals_of(problem.goal)
         joint_goals_only = all(isinstance(goal, JointGoal) for goal in goals)
         longest = np.inf if joint_goals_only else MAX_DETOUR * float(search.straight.min())
         search.motions = TimeOptimization(
