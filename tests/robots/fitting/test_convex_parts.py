@@ -1,5 +1,6 @@
 """Convex parts contain their mesh, follow it closely, and are few and simple."""
 
+import tracemalloc
 from functools import cache
 
 import numpy as np
@@ -104,3 +105,14 @@ def test_a_needle_is_split_into_as_many_pieces_as_it_is_long() -> None:
     assert np.linalg.norm(pieces - np.roll(pieces, 1, axis=1), axis=2).max() <= 1 + 1e-12
     areas = np.linalg.norm(np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]), axis=1) / 2
     assert areas.sum() == pytest.approx(3 * 0.5, rel=1e-9)
+
+
+def test_a_hull_of_many_corners_is_simplified_in_little_memory() -> None:
+    """Regression: a table of corners by planes took 5 GB for a dome of 1.3 million triangles."""
+    ball = trimesh.creation.icosphere(subdivisions=6)
+    hull = ConvexMesh(np.array(ball.vertices), np.array(ball.faces))
+    tracemalloc.start()
+    simple = convex_parts.simplified(hull)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(simple.faces) < 1000 and peak < 100e6

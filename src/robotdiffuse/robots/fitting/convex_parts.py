@@ -244,7 +244,8 @@ def simplified(hull: ConvexMesh, settings: PartSettings = PartSettings()) -> Con
         _, first = np.unique(np.round(normals * 12).astype(int) @ [1, 100, 10_000], return_index=True)
         normals = normals[first]
     normals = np.concatenate([np.eye(3), -np.eye(3), normals])
-    offsets = (hull.vertices @ normals.T).max(0) + SIMPLIFIED_GROWTH
+    # plane by plane: a table of 650,000 corners and 1,000 planes would take 5 GB
+    offsets = np.array([(hull.vertices @ normal).max() for normal in normals]) + SIMPLIFIED_GROWTH
     chosen = list(range(6))
     middle = hull.vertices.mean(0)
     try:
