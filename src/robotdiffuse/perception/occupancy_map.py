@@ -2,7 +2,7 @@
 ViewMemory: keeps the views that showed most new voxels.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -90,8 +90,7 @@ class OccupancyMap:
         """
         q = self.configuration_of(view)
         state, _, counts = carve_view(view, self.robot, q, MAP)
-        error = sum(view.pose_deviation) + END_SPREADS * filtered(view).spread  # at 1 m
-        new_voxels = self._update(state, counts, stamp, error)
+        new_voxels = self._update(state, counts, stamp, [view])
         if any(view.pose_deviation):
             state, _, _ = carve_view(view, self.robot, q, MAP, narrowed=1.0)
         self._surely_free |= state == FREE
@@ -187,11 +186,11 @@ class OccupancyMap:
         state: UInt8[ndarray, "nx ny nz"],
         counts: Int32[ndarray, "nx ny nz"],
         stamp: float,
-        error: float = 0.0,
+        views: Sequence[DepthView] = (),
     ) -> int:
         """Add a view's evidence for each voxel. Returns the number of voxels observed for the first time.
 
-        error: points may be displaced by this [m], so that surfaces seem to appear next to where they are.
+        views: the view, if there is one. Its errors may displace surfaces, which then have not appeared.
         """
         self._now = max(self._now, stamp)
         self._known = None
@@ -205,7 +204,8 @@ class OccupancyMap:
         # an object that appears is there at once, however often its space was seen free before
         free = self._evidence < 0
         points = MAP.centers(np.argwhere((counts > 0) & free))
-        appeared = points[MAP.enclose(free, points, MAP.edge + error)]
+        errors = point_errors(views, points)
+        appeared = points[MAP.enclose(free, points, MAP.edge + errors @ (1.0, END_SPREADS))]
         self.stale &= ~observed
         if len(appeared):
             near = MAP.within(np.insert(appeared, 3, APPEARED_PADDING, axis=1)) & free & (state != FREE)

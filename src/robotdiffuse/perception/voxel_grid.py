@@ -69,10 +69,10 @@ class VoxelGrid:
         marks[marks] = marked[tuple(at[marks].T)]
         return marks
 
-    def enclose(self, marked: Voxels, points: Points, distance: float) -> Bool[ndarray, "n"]:
-        """Whether each point is in a marked voxel, with marked voxels at a distance on all six sides [m]."""
-        sides = np.vstack([np.eye(4, 3), -np.eye(3)]) * distance  # the fourth is zero
-        return np.all([self.hold(marked, points + side) for side in sides], axis=0)
+    def enclose(self, marked: Voxels, points: Points, distance: Float[ndarray, "n"]) -> Bool[ndarray, "n"]:
+        """Whether each point is in a marked voxel, with marked voxels on all six sides at a distance [m]."""
+        sides = np.vstack([np.eye(4, 3), -np.eye(3)])  # the fourth is zero
+        return np.all([self.hold(marked, points + np.outer(distance, side)) for side in sides], axis=0)
 
     def filled(self, robot: Robot, configurations: Iterable[Configuration], margin: float = 0.0) -> Voxels:
         """Voxels with their centers in the arm's covering spheres, inflated by `margin` [m], at any of these
