@@ -27,7 +27,9 @@ from robotdiffuse.trajectories.speed_limits import jerk_limits
 from robotdiffuse.validation.validator import verifier
 
 ROW_TIME = 0.004
-"""Time between the rows of a stop [s]."""
+"""Largest time between the rows while a stop brakes [s]."""
+LEAST_STEP = 1e-3
+"""Smallest time between the rows of a stop [s]; a stop takes at least this long."""
 BRAKING_DELAY = 0.02
 """Step between the times at which braking may begin [s]."""
 BRAKING_TIMES = 0.05 * 1.12 ** np.arange(35)
@@ -91,16 +93,16 @@ def braked(robot: Robot, motion: Trajectory, time: float) -> Trajectory:
     """The motion from `time` on, slowed to rest after as little of the path as the limits allow. It stays on
     the path. If no braking that was tried keeps the limits, it is the rest of the motion. Braking for b
     seconds uses up b / 2 of the motion's time."""
-    best = _rows(motion, time, motion.duration - time, 0.0, RAMPS[0])
-    stop_time = motion.duration
-    for delay in np.arange(0.0, motion.duration - time, BRAKING_DELAY):
+    used = motion.duration - time
+    best = _rows(motion, time, max(used, LEAST_STEP), 0.0, RAMPS[0])
+    for delay in np.arange(0.0, used, BRAKING_DELAY):
         for braking, ramp in product(BRAKING_TIMES, RAMPS):
-            if time + delay + braking / 2 >= stop_time:
+            if delay + braking / 2 >= used:
                 break
             candidate = _rows(motion, time, float(delay), float(braking), ramp)
             if _within_limits(robot, candidate):
                 best = candidate
-                stop_time = time + delay + braking / 2
+                used = delay + braking / 2
                 break
     return best
 
@@ -111,9 +113,11 @@ def _rows(motion: Trajectory, time: float, delay: float, braking: float, ramp: f
     While braking, the motion's time passes with a speed that falls from 1 to 0. The deceleration of this
     speed is a trapezoid: it rises for `ramp` of the braking time, is constant, and falls for `ramp`.
     """
-    duration = delay + braking
-    count = max(int(np.ceil(duration / ROW_TIME)), 1)
-    times = duration * np.arange(count + 1) / count
+    # rows between those of the motion would miss its accelerations
+    after = motion.times - time
+    unchanged = after[(after > LEAST_STEP) & (after < delay - LEAST_STEP)]
+    slowed = np.linspace(delay, delay + braking, int(braking / ROW_TIME) + 2)
+    times = np.unique([0.0, *unchanged, *slowed])
     scale = max(braking, ROW_TIME)  # `braking` is 0 if the motion does not brake
     u = np.maximum(times - delay, 0.0) / scale
     slowing, loss, lost_time = _braking(ramp)
@@ -134,8 +138,7 @@ def _braking(ramp: float) -> tuple[BSpline, BSpline, BSpline]:
 
 
 def _within_limits(robot: Robot, motion: Trajectory) -> bool:
-    jerks = np.diff(motion.accelerations, axis=0) / np.diff(motion.times)[:, None]
-    return bool(
-        (np.abs(motion.accelerations) <= (1 + LIMIT_TOLERANCE) * robot.acceleration).all()
-        and (np.abs(jerks) <= (1 + LIMIT_TOLERANCE) * jerk_limits(robot)).all()
-    )
+    start, end = motion.cubic_accelerations
+    jerks = (end - start) / np.diff(motion.times)[:, None]
+    limits = np.array([robot.acceleration, robot.acceleration, jerk_limits(robot)])
+    return bool((np.abs([start, end, jerks]) <= (1 + LIMIT_TOLERANCE) * limits[:, None]).all())
