@@ -474,10 +474,10 @@ class UrdfTree:
         with a note."""
         inertias = {}
         for link in links:
-            mass = self.links[link].find("inertial/mass")
-            if mass is None or mass.get("value", "").strip() in ("0", "0.0"):
+            element = self.links[link].find("inertial")
+            mass = None if element is None else element.find("mass")
+            if element is None or mass is None or mass.get("value", "").strip() in ("0", "0.0"):
                 continue
-            (element,) = self.links[link].findall("inertial")
             attributes = _attributes(element, "inertia")
             try:
                 T = self._origin(element, link)
