@@ -42,6 +42,9 @@ MOST_EVIDENCE = np.float32(8.0)
 """Evidence is clipped to ± this, so that a few views suffice to change a voxel's state."""
 APPEARED_PADDING = 0.05
 """Radius of points that appear in space that was free before [m]: only the front of their object is seen."""
+MIN_APPEARED = 12
+"""An object appears only if a view has points in so many voxels that are deep in free space; in simulations
+with noise and inexact poses, errors filled up to 4."""
 COVER_RADIUS = MAP.edge * 3**0.5 / 2
 """Radius of the ball around a voxel's center that covers the voxel [m]."""
 
@@ -207,7 +210,7 @@ class OccupancyMap:
         errors = point_errors(views, points)
         appeared = points[MAP.enclose(free, points, MAP.edge + errors @ (1.0, END_SPREADS))]
         self.stale &= ~observed
-        if len(appeared):
+        if len(appeared) >= (MIN_APPEARED if views else 1):
             near = MAP.within(np.insert(appeared, 3, APPEARED_PADDING, axis=1)) & free & (state != FREE)
             self._evidence[near] = 0.0
             self._surely_free[near] = False
