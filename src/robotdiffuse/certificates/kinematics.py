@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from robotdiffuse.core.transforms import rotation_about
 from robotdiffuse.core.types import (
     Configurations,
     JointRows,
@@ -19,6 +20,7 @@ from robotdiffuse.core.types import (
     Trajectory,
     Values,
 )
+from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import Robot
 
 
@@ -60,25 +62,39 @@ class Linkage:
         origins = np.zeros((n, dof, 3))
         axes = np.zeros((n, dof, 3))
         at = {self.robot.base: np.tile(np.eye(4), (n, 1, 1))}
-        for joint in self.robot.joints if link is None else self.robot.joints_above(link):
+        for joint in self.robot.joints if link is None else self._up_to(link):
             T_base_joint = at[joint.parent] @ joint.T_parent_joint
             j = self._planned.get(joint.name)
             value = np.full(n, self.robot.locked.get(joint.name, 0.0)) if j is None else q[:, j]
             if j is not None:
                 origins[:, j] = T_base_joint[:, :3, 3]
                 axes[:, j] = T_base_joint[:, :3, :3] @ joint.axis
-            at[joint.child] = T_base_joint @ joint.motion(value)
+            motion = np.tile(np.eye(4), (n, 1, 1))
+            if joint.kind == "prismatic":
+                motion[:, :3, 3] = value[:, None] * joint.axis
+            elif joint.kind != "fixed":
+                motion[:, :3, :3] = rotation_about(joint.axis, value[:, None, None])
+            at[joint.child] = T_base_joint @ motion
         for k, name in enumerate(self.links):
             if name in at:
                 T[:, k] = at[name]
         return Postures(T, origins, axes)
+
+    def _up_to(self, link: str) -> list[Joint]:
+        """Joints from the base to a link, parents first."""
+        chain = list[Joint]()
+        above = {joint.child: joint for joint in self.robot.joints}
+        while link in above:
+            chain.append(above[link])
+            link = above[link].parent
+        return chain[::-1]
 
     def levers(self, link: str, q: Configurations) -> Float[ndarray, "joints"]:
         """Upper bounds on the distance of a link's origin from the axis of each planned joint that moves it,
         base first [m]; 1 for a prismatic joint. q: rows that contain the extreme position of each joint."""
         bounds = list[float]()
         length = 0.0
-        for joint in reversed(self.robot.joints_above(link)):
+        for joint in reversed(self._up_to(link)):
             j = self._planned.get(joint.name)
             if j is not None:
                 bounds.append(1.0 if self.slides[j] else length)

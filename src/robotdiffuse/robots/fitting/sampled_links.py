@@ -102,7 +102,9 @@ class Links:
         poses = {self.robot.base: np.tile(np.eye(4), (len(q), 1, 1))}
         values = with_mimics(self.robot.joints, {joint.name: q[:, i] for i, joint in enumerate(self.joints)})
         for joint in joints:
-            T_parent_child = joint.T_parent_joint @ joint.motion(values.get(joint.name, 0.0))
+            T_parent_child = joint.T_parent_joint
+            if joint.kind in MOVING_KINDS:
+                T_parent_child = T_parent_child @ joint.motion(values[joint.name])
             poses[joint.child] = poses[joint.parent] @ T_parent_child
         return poses
 
