@@ -80,7 +80,7 @@ def test_elbows_that_cannot_fold_through_reach_a_goal_on_the_other_side() -> Non
     """Regression: if two elbows on continuous joints had to turn back by way of zero, no goal let both do so: no path."""
     start = np.array([3.0, 1.0, 3.0])
     rows = ARM.turned_both_ways(-start, start, ARM.continuous)
-    np.testing.assert_allclose(rows[[0, -1]], [[2 * np.pi - 3, -1.0, 2 * np.pi - 3], -start])
+    np.testing.assert_allclose(rows[[0, -1]], np.stack([np.array([2 * np.pi - 3, -1.0, 2 * np.pi - 3]), -start]))
     assert len(rows) == 4
 
 
