@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -160,7 +161,7 @@ def test_a_module_of_the_current_folder_adds_planners_and_shapes(
         "class Ball(Sphere):\n    kind = 'ball'\nSHAPES['ball'] = Ball\n"
     )
     problem = write_problem(tmp_path, scene=[{"ball": {"center": [0.5, 0.0, 1.5], "radius": 0.1}}])
-    try:
+    with patch.dict(PLANNERS), patch.dict(SHAPES):
         assert "my own" in said(0, "planner", "list", "--import", "added")
         assert run("plan", problem, "--planner", "mine", "--import", "added", "--out", "result.json") == 0
         SHAPES.pop("ball")
@@ -173,9 +174,6 @@ def test_a_module_of_the_current_folder_adds_planners_and_shapes(
             ("verify", "a.csv", "--problem", problem),
         ):
             assert run(*command, "--import", "added") == 0
-    finally:
-        PLANNERS.pop("mine", None)
-        SHAPES.pop("ball", None)
     error = said(2, "planner", "list", "--import", "no_such_module")
     assert "module 'no_such_module' cannot be imported: ModuleNotFoundError" in error
 

@@ -6,8 +6,10 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -107,21 +109,15 @@ TABLES: tuple[dict[str, Any], ...] = (*(PLANNERS, FAMILIES, METRICS, SHAPES), *(
 def names(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     """The names that the page's Python defines, while its entries are in the tables."""
     folder = tmp_path_factory.mktemp("extending")
-    tables = [dict(table) for table in TABLES]
     notebook = Notebook(folder)
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, ExitStack() as as_before:
         patch.chdir(folder)
         patch.syspath_prepend(folder)
-        try:
-            for block in code_blocks(ROOT / "docs" / "extending.md"):
-                notebook.try_block(block)
-            yield notebook.names
-        finally:
-            for table, before in zip(TABLES, tables, strict=True):
-                table.clear()
-                table.update(before)
-            for file in folder.glob("*.py"):
-                sys.modules.pop(file.stem, None)
+        for table in (*TABLES, sys.modules):
+            as_before.enter_context(mock.patch.dict(table))
+        for block in code_blocks(ROOT / "docs" / "extending.md"):
+            notebook.try_block(block)
+        yield notebook.names
 
 
 def test_planners_solve_parts_of_networks_are_used_by_name_and_a_metric_is_measured(names: dict[str, Any]) -> None:

@@ -99,30 +99,21 @@ def rop_data(folder: Path) -> None:
     shutil.copytree(_rop(folder.parent), folder / "rop")
 
 
-def bench_arm(folder: Path) -> None:
-    """Prepares the robot of arm.urdf with few, large spheres, since `robot add` takes a minute."""
+def arm(urdf: str, **how: str) -> None:
+    """Prepares the robot of a URDF with few, large spheres, since `robot add` takes a minute."""
     with coarse_grids():
-        add_robot("arm.urdf", base="base", limits="joint_limits.yaml", settings=QUICK)
+        add_robot(urdf, settings=QUICK, **how)
 
 
-def example_arm(folder: Path) -> None:
-    """Prepares the robot of examples/data/arm.urdf with few, large spheres."""
-    with coarse_grids():
-        add_robot("examples/data/arm.urdf", settings=QUICK)
-
-
-def shelf(folder: Path) -> None:
-    """Writes shelf.stl: a board."""
-    trimesh.creation.box((0.3, 0.8, 0.02)).export(folder / "shelf.stl")
-
-
-def motion_bench_maker(folder: Path) -> None:
-    """Writes motion_bench_maker: scenes and requests of MoveIt."""
-    shutil.copytree(ROOT / "tests" / "files" / "motion_bench_maker", folder / "motion_bench_maker")
-
-
-PREPARED: dict[str, Callable[[Path], None]] = {"cloud.ply": a_cloud, "rop": rop_data, "shelf.stl": shelf}
-PREPARED |= {made.__name__: made for made in (bench_arm, example_arm, motion_bench_maker)}
+MOTION_BENCH_MAKER = "motion_bench_maker"
+PREPARED: dict[str, Callable[[Path], object]] = {
+    "cloud.ply": a_cloud,
+    "rop": rop_data,
+    "shelf.stl": lambda folder: trimesh.creation.box((0.3, 0.8, 0.02)).export(folder / "shelf.stl"),
+    "bench_arm": lambda _: arm("arm.urdf", base="base", limits="joint_limits.yaml"),
+    "example_arm": lambda _: arm("examples/data/arm.urdf"),
+    MOTION_BENCH_MAKER: lambda folder: shutil.copytree(ROOT / "tests/files" / MOTION_BENCH_MAKER, folder / MOTION_BENCH_MAKER),
+}
 
 
 @dataclass

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
-from robotdiffuse.robots.parsing.srdf import Srdf
 from robotdiffuse.robots.parsing.urdf import UrdfTree
 from robotdiffuse.robots.robot import Robot
 
@@ -54,13 +54,5 @@ def written(folder: Path, *parts: str, file: str = "made.urdf", name: str = "mad
     return folder / file
 
 
-def read_urdf(
-    path: str | Path,
-    base: str | None = None,
-    tip: str | None = None,
-    locked: dict[str, float] | None = None,
-    group: str | None = None,
-    srdf: Srdf | None = None,
-    packages: dict[str, str | Path] | None = None,
-) -> Robot:
-    return UrdfTree(Path(path), packages or {}, compile_xacro=True).robot(base, tip, locked, group, srdf)
+def read_urdf(path: Path, packages: dict[str, str | Path] | None = None, **how: Any) -> Robot:
+    return UrdfTree(path, packages or {}, compile_xacro=True).robot(**how)

@@ -80,9 +80,7 @@ MISTAKES = {
     "as OpenGL": lambda T: T @ np.diag([1.0, -1, -1, 1]),
     "has a transposed rotation": lambda T: transform(T[:3, 3], T[:3, :3].T),
     "x y z w that was read as w x y z": lambda T: pose(T[:3, 3], wxyz=Rotation.from_matrix(T[:3, :3]).as_quat()),
-    "w x y z that was read as x y z w": lambda T: transform(
-        T[:3, 3], Rotation.from_quat(quaternion_from_rotation(T[:3, :3])).as_matrix()
-    ),
+    "w x y z that was read as x y z w": lambda T: pose(T[:3, 3], wxyz=np.roll(quaternion_from_rotation(T[:3, :3]), 1)),
 }
 
 

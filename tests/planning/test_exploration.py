@@ -397,12 +397,8 @@ def test_stops_keep_the_limits_and_begin_as_the_motion_was(motion: rd.Trajectory
     time = float(share * motion.duration)
     stop = braked(PANDA, motion, time)
     state = motion.at(time)
-    for rows, wanted in (
-        (stop.positions, state.positions),
-        (stop.velocities, state.velocities),
-        (stop.accelerations, state.accelerations),
-    ):
-        np.testing.assert_allclose(rows[0], wanted, atol=1e-9)
+    for name in ("positions", "velocities", "accelerations"):
+        np.testing.assert_allclose(getattr(stop, name)[0], getattr(state, name), atol=1e-9)
     assert np.abs(stop.velocities[-1]).max() < 1e-9 and np.abs(stop.accelerations[-1]).max() < 1e-9
     assert (np.abs(stop.velocities) <= PANDA.velocity * (1 + 1e-6)).all()
     assert (np.abs(stop.accelerations) <= PANDA.acceleration * (1 + 1e-3)).all()

@@ -1,6 +1,7 @@
 """A workspace: obstacles that are added, moved and removed, held objects, lines, a moved base, lists of steps."""
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -276,14 +277,13 @@ def test_joined_motions_keep_the_limits_of_the_call() -> None:
 def test_motions_with_other_payloads_or_moving_obstacles_are_not_joined() -> None:
     """Regression: those of the first motion counted for all."""
     scene, end = rd.Scene(), [0.6, 0.2, 0, -1.8, 0, 2.2, 0.2]
-    there = rd.plan(rd.Problem(PANDA, scene, "ready", end), 10.0, until="first")
-    load = rd.Payload(1.0, [0, 0, 0.1])
     cart = rd.MovingObstacle(rd.Sphere([3.0, 0.0, 0.5], 0.1, "cart"), velocity=[0.1, 0.0, 0.0])
-    for more in ({"payload": load}, {"moving": [cart]}):
-        back = rd.plan(rd.Problem(PANDA, scene, end, "ready", **more), 10.0, until="first")  # type: ignore[arg-type]
-        refuses("another robot, scene or payload", rd.join, [there, back])
-    both = [
-        rd.plan(rd.Problem(PANDA, scene, *ends, payload=rd.Payload(1.0, [0, 0, 0.1])), 10.0, until="first")
-        for ends in (("ready", end), (end, "ready"))
-    ]
-    assert rd.join(both).problem.payload is not None
+
+    def planned(start: Any, goal: Any, **more: Any) -> rd.PlanResult:
+        return rd.plan(rd.Problem(PANDA, scene, start, goal, **more), 10.0, until="first")
+
+    there, loaded = (planned("ready", end, payload=load) for load in (None, rd.Payload(1.0, [0, 0, 0.1])))
+    back = planned(end, "ready", payload=rd.Payload(1.0, [0, 0, 0.1]))
+    for other in (back, planned(end, "ready", moving=[cart])):
+        refuses("another robot, scene or payload", rd.join, [there, other])
+    assert rd.join([loaded, back]).problem.payload is not None

@@ -19,6 +19,7 @@ from robotdiffuse.robots.fitting.covering_spheres import MAX_SPHERES, cover
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import robot_fingerprint
 from robotdiffuse.scenes.shapes import Shape
+from robotdiffuse.scenes.surface_points import draw
 
 rng = np.random.default_rng(0)
 CLOUD = rng.normal(size=(40, 3)) * [0.05, 0.03, 0.1]
@@ -58,31 +59,13 @@ def test_spheres_cover_surface_and_inside(mesh: ConvexMesh) -> None:
     assert len(spheres) <= MAX_SPHERES
 
 
-def surface_points(shape: Shape) -> ndarray:
-    """Points on the true surface of a shape at its pose."""
-    if isinstance(shape, rd.Mesh):
-        return shape.world_vertices
-    d = np.random.default_rng(2).normal(size=(2000, 3))
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-    if isinstance(shape, rd.Sphere):
-        return shape.center + shape.radius * d
-    if isinstance(shape, rd.Box):
-        local = d / np.abs(d).max(axis=1, keepdims=True) * shape.size / 2
-    elif isinstance(shape, rd.Cylinder):
-        flat = d[:, :2] / np.linalg.norm(d[:, :2], axis=1, keepdims=True)
-        local = np.column_stack([shape.radius * flat, shape.height / 2 * np.sign(d[:, 2])])
-    else:
-        assert isinstance(shape, rd.Capsule)
-        local = shape.radius * d + np.sign(d[:, 2:]) * [0, 0, shape.height / 2]
-    return local @ shape.rotation.T + shape.center
-
-
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.kind)
 def test_polyhedra_hold_shapes_and_are_little_larger(shape: Shape) -> None:
     robot = box_arm().attach(shape, "l3")
     [body] = robot.attached
     T = body.T_link_body
-    points = (surface_points(shape) - T[:3, 3]) @ T[:3, :3]
+    surface = shape.world_vertices if isinstance(shape, rd.Mesh) else draw(shape, 2000, np.random.default_rng(2))
+    points = (surface - T[:3, 3]) @ T[:3, :3]
     [mesh] = robot.meshes[shape.name]
     assert inside(mesh, points, 1e-9).all()
     assert (np.ptp(mesh.vertices, axis=0) <= np.ptp(points, axis=0) * 1.03 + 1e-3).all()

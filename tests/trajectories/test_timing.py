@@ -491,14 +491,7 @@ def test_the_time_of_a_line_goes_exactly_its_distance(limits):
 
 
 def test_along_a_line_as_toppra_times_it():
-    v = np.array([1.0, 0.7])
-    a = np.array([2.0, 3.0])
+    robot = arm((1.0, 0.7), (2.0, 3.0))
     for goal in (FAR, NEAR):
-        path = toppra.SplineInterpolator([0.0, 1.0], np.stack([START, goal]))
-        limits = [
-            toppra.constraint.JointVelocityConstraint(np.stack([-v, v], axis=1)),
-            toppra.constraint.JointAccelerationConstraint(np.stack([-a, a], axis=1)),
-        ]
-        by_toppra = toppra.algorithm.TOPPRA(limits, path, np.linspace(0.0, 1.0, 1001), parametrizer="ParametrizeConstAccel")
-        trajectory: Any = by_toppra.compute_trajectory(0, 0)
-        assert straight_line_time(START, goal, v, a) == pytest.approx(trajectory.duration, rel=5e-3)
+        duration = toppra_duration(robot, rounded_line(np.stack([START, goal]), np.zeros(0)), DEFAULT)
+        assert straight_line_time(START, goal, robot.velocity, robot.acceleration) == pytest.approx(duration, rel=5e-3)

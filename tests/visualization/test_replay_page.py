@@ -2,16 +2,20 @@
 
 import base64
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import robotdiffuse as rd
 from helpers.pages import page_data
+from helpers.panda import GOAL, PANDA, START
 from helpers.refusals import refuses
+from robotdiffuse.core.transforms import transform
 from robotdiffuse.drawables import decimated
 from robotdiffuse.visualization import PictureSettings, write_picture, write_replay
 from robotdiffuse.visualization.arm import DrawnArm
+from robotdiffuse.visualization.replay_page import COLLIDING, write_problem
 
 pytestmark = pytest.mark.usefixtures("few_lights")
 SMALL = PictureSettings(width=320, height=200, ghosts=2)
@@ -93,3 +97,41 @@ def test_moving_obstacles_are_on_the_page_and_in_the_picture(arm, motion, tmp_pa
     for name, moving in (("with", [ball]), ("without", [])):
         write_picture(arm, rd.Scene(), motion, tmp_path / f"{name}.png", settings=SMALL, moving=moving)
     assert (tmp_path / "with.png").read_bytes() != (tmp_path / "without.png").read_bytes()
+
+
+AT_START = rd.Sphere(PANDA.fk(START, "panda_hand")[:3, 3], 0.05, "ball")
+FAR = transform(np.array([1.5, 0.0, 0.0]))
+
+
+def page(problem: rd.Problem, file: Path) -> dict:
+    write_problem(problem, file)
+    return page_data(file)
+
+
+def marks(data: dict, color: tuple[int, int, int]) -> list[dict]:
+    return [shape for shape in data["scene"] if tuple(shape["color"]) == color]
+
+
+def test_links_that_collide_are_red(tmp_path: Path) -> None:
+    problem = rd.Problem(PANDA, rd.Scene([AT_START]), START, GOAL)
+    data = page(problem, tmp_path / "a.html")
+    assert len(marks(data, COLLIDING)) == len(problem.is_free(START).links) > 0
+    assert data["positions"] == [START.tolist(), GOAL.tolist()] and data["times"] == [0.0, 0.0]
+    assert dict(data["facts"])["start"].endswith("inside ball") and dict(data["facts"])["goal"] == "free"
+    assert not marks(page(rd.Problem(PANDA, rd.Scene(), START, GOAL), tmp_path / "b.html"), COLLIDING)
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_goal_out_of_reach_has_axes(moved: bool, tmp_path: Path) -> None:
+    problem = rd.Problem(PANDA, rd.Scene(), START, rd.PoseGoal("panda_hand", FAR))
+    if moved:
+        T = transform(np.array([1.0, 2.0, 0.5]))
+        problem = rd.Problem.in_world(T, PANDA, rd.Scene(), START, rd.PoseGoal("panda_hand", T @ FAR))
+    data = page(problem, tmp_path / "a.html")
+    assert data["positions"] == [START.tolist()] and len(data["scene"]) == 3
+    assert dict(data["facts"])["goal"] == "no configuration within the joint limits"
+
+
+def test_of_several_goals_a_free_one_is_drawn(tmp_path: Path) -> None:
+    problem = rd.Problem(PANDA, rd.Scene([AT_START]), GOAL, [START, GOAL])
+    assert page(problem, tmp_path / "a.html")["positions"][1] == GOAL.tolist()

@@ -1,7 +1,9 @@
-"""Problems: what the constructor refuses and repairs; problem files, and all that can be wrong in them."""
+"""Problems: what the constructor refuses and repairs, is_free, notes on units; problem files, and what can be wrong in them."""
 
 import json
 import re
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +14,17 @@ from hypothesis import given, strategies as st
 import robotdiffuse as rd
 from helpers.commands import written
 from helpers.full_disk import full_disk
-from helpers.panda import PANDA
+from helpers.panda import HOME, PANDA
 from helpers.refusals import refuses
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import OutputError
-from robotdiffuse.core.transforms import rotation_about, rotation_from_rpy, transform
+from robotdiffuse.core.transforms import inverse, rotation_about, rotation_from_rpy, transform
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.problems.files import load_problems, problem_from_record, problem_record, save_problem
+from robotdiffuse.problems.units import arm_in_cloud_note, unit_notes
 from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.scenes.shapes import Shape
 
 Z = np.array([0.0, 0.0, 1.0])
 READY = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
@@ -301,3 +308,240 @@ def test_roll_pitch_yaw_are_in_the_order_of_urdfs() -> None:
     box = {"center": [0.9, 0, 0], "size": [0.1, 0.2, 0.3], "rpy": [0.1, 0.2, 0.3]}
     [shape] = problem_from_record(BASIC | {"scene": [{"box": box}]}).scene.shapes
     np.testing.assert_allclose(shape.T_base_shape[:3, :3], rotation_from_rpy(0.1, 0.2, 0.3), atol=1e-12)
+
+
+Q = np.array([0.0, 0.3, 0, -1.8, 0, 2.1, 0.8])
+HAND = PANDA.fk(Q, "panda_hand")[:3, 3]
+PROBLEM = rd.Problem(PANDA, rd.Scene([rd.Sphere(HAND, 0.05, "ball")]), "ready", "extended")
+
+
+def test_a_free_configuration_is_true_without_a_reason() -> None:
+    for q in ("ready", PANDA.poses["ready"].values(), Q * [-1, 1, 1, 1, 1, 1, 1] + [1, 0, 0, 0, 0, 0, 0]):
+        state = PROBLEM.is_free(q if isinstance(q, str) else list(q))
+        assert state and state.reason == "" and state.links == ()
+
+
+def test_the_reason_names_links_and_obstacle_or_the_limit_and_a_wrong_shape_is_an_error() -> None:
+    state = PROBLEM.is_free(Q)
+    assert not state and state.reason.startswith("panda_hand is ") and state.reason.endswith("inside ball")
+    assert state.links[0] == "panda_hand"
+    state = rd.Problem(PANDA, rd.Scene(), Q, Q).is_free([0, 0, 0, -3.0, 0, 0, 0])
+    assert not state and "overlap" in state.reason and len(state.links) >= 2
+    assert PROBLEM.is_free([9.0, *Q[1:]]).reason.startswith("panda_joint1 is 9 rad; its limits are")
+    refuses("q has 2 values", PROBLEM.is_free, [1, 2])
+    refuses("unknown pose in q: 'home'; known: extended, ready", PROBLEM.is_free, "home")
+
+
+def test_it_agrees_with_the_validator() -> None:
+    scene = rd.Scene([rd.Box([0.5, 0, 0.4], [0.3, 0.6, 0.05]), rd.Sphere([-0.3, 0.3, 0.6], 0.2)])
+    states = []
+    for q in np.random.default_rng(0).uniform(PANDA.lower, PANDA.upper, (60, 7)):
+        problem = rd.Problem(PANDA, scene, q, q)
+        report = rd.verify(problem, rd.Path(PANDA.joint_names, q[None]))
+        states.append(bool(problem.is_free(q)))
+        assert states[-1] == report.valid, report.violation
+    assert 5 < sum(states) < 55
+
+
+def test_the_least_distance_at_one_configuration_or_several() -> None:
+    q = np.array([Q, [0.6, *Q[1:]]])
+    checker = CollisionChecker(PANDA, PROBLEM.scene)
+    expected = np.hstack([checker.link_clearances(q), checker.pair_clearances(q)]).min(axis=1)
+    np.testing.assert_allclose(PROBLEM.clearance_at(q), expected)
+    one = PROBLEM.clearance_at(Q.tolist())
+    assert isinstance(one, float) and one == pytest.approx(expected[0])
+    refuses(r"q is .* it must be 7 numbers", PROBLEM.clearance_at, [0.0])
+
+
+TO = [0.4, -0.7, 0.0, -2.3, 0.0, 1.571, 0.785]
+
+
+@cache
+def seen() -> rd.DepthView:
+    """A depth view of a box beside the arm, from a camera in front of the arm."""
+    camera = looking_at(np.array([1.7, 0.0, 0.6]), np.array([0.4, 0.0, 0.3]))
+    lens = (75.0, 75.0, 39.5, 29.5)
+    return ray_cast(rd.Scene([rd.Box([0.0, -0.8, 0.3], [0.2, 0.2, 0.6])]), camera, lens, (80, 60), PANDA, HOME)
+
+
+CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+FACES = [[0, 1, 3], [0, 3, 2], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4]]
+
+
+def _notes(*shapes: rd.Box | rd.Mesh | rd.PointCloud | rd.Sphere, **options: object) -> tuple[str, ...]:
+    return unit_notes(rd.Problem(PANDA, rd.Scene(shapes), HOME, TO, **options))  # type: ignore[arg-type]
+
+
+def test_obstacles_in_millimeters_are_noted() -> None:
+    for shape, text in (
+        (rd.Mesh(200 * CUBE + [500, 300, 600], FACES), "mesh is 200 m long"),
+        (rd.PointCloud(1600 * CUBE - 800), "point_cloud is 1600 m long"),
+        (rd.Sphere([0, 5, 0], 0.2), "beyond the arm's reach of"),
+    ):
+        [note] = _notes(shape)
+        assert note.startswith("check the units") and text in note and "millimeters" in note
+
+
+def test_scenes_in_meters_have_no_notes_on_units() -> None:
+    floor = rd.Box([0, 0, -0.6], [30, 30, 1], name="floor")
+    assert _notes() == _notes(floor) == _notes(rd.Sphere([0.5, 0.3, 0.6], 0.1), rd.Sphere([0, 9, 0], 0.1)) == ()
+    assert _notes(rd.PointCloud(CUBE), rd.PointCloud(np.zeros((0, 3)))) == ()
+    [note] = _notes(rd.PointCloud(np.zeros((0, 3))), rd.Sphere([0, 5, 0], 0.2, name="ball"))
+    assert "the obstacle ball is beyond" in note, "it named the empty cloud"
+
+
+def test_a_depth_image_in_millimeters_is_noted() -> None:
+    assert _notes(views=[seen()]) == ()
+    wrong = [rd.DepthView(1000 * seen().depth, seen().intrinsics, seen().T_base_camera)]
+    [note] = _notes(views=wrong)
+    assert "depths of views[0] begin at" in note and "millimeters" in note
+    problem = rd.Problem(PANDA, rd.Scene(), HOME, TO, views=wrong, unknown="padded")
+    assert rd.load_planner("aorrtc").plan(problem).notes.count(note) == 1
+
+
+def test_intrinsics_for_images_of_another_size_are_noted() -> None:
+    """Regression: without the arm in the image, nothing told that intrinsics were those before the image was resized."""
+    for factor in (0.5, 2.0):
+        [note] = _notes(views=[replace(seen(), intrinsics=tuple(factor * np.array(seen().intrinsics)))])
+        assert note.startswith("check the intrinsics of views[0]: cx and cy") and "(60, 80) pixels" in note
+
+
+def test_what_views_see_in_reach_is_no_scene_beyond_it() -> None:
+    problem = rd.Problem(PANDA, rd.Scene([rd.Sphere([0, 5, 0], 0.2)]), HOME, TO, views=[seen()], unknown="padded")
+    notes = rd.load_planner("aorrtc").plan(problem).notes
+    assert all(note.startswith("compiled for") for note in notes), notes
+
+
+def test_a_cloud_that_the_arm_stands_in_is_noted() -> None:
+    scene = rd.Scene([rd.PointCloud(np.random.default_rng(0).uniform(-0.5, 0.8, (3000, 3)), name="scan")])
+    result = rd.load_planner("aorrtc").plan(rd.Problem(PANDA, scene, HOME, TO), time_limit=60.0)
+    assert result.status is rd.Status.INVALID_START
+    assert "points of scan are within the arm" in result.notes[0] and "millimeters" in result.notes[0]
+    assert arm_in_cloud_note(PANDA, rd.Scene([rd.PointCloud(CUBE + 2)]), HOME) == ""
+
+
+START = [-0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2]
+GOAL = [0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2]
+WALL = {"box": {"center": [0.5, 0.0, 0.25], "size": [0.3, 0.06, 0.3], "name": "wall"}}
+CUP = {"link": "panda_hand", "cylinder": {"center": [0, 0, 0.16], "radius": 0.03, "height": 0.12, "name": "cup"}}
+PLAIN: dict[str, Any] = {"robot": "panda", "scene": [WALL], "start": START, "goal": {"joints": GOAL}}
+TOOL = {
+    "link": "panda_hand",
+    "xyz": [0.0, 0.0, 0.2],
+    "shapes": [{"box": {"center": [0, 0, 0.14], "size": [0.03, 0.03, 0.12]}}],
+    "touch_links": ["panda_link6"],
+}
+T_WORLD_BASE = transform(np.array([1.0, -2.0, 0.5]), rotation_about(np.array([0.6, 0.0, 0.8]), 2.0))
+WORLD_SHAPES: list[Shape] = [
+    rd.Sphere([0.5, 0.5, 0.5], 0.1),
+    rd.Box([0.4, 0.0, 0.1], [0.3, 0.2, 0.1], [0.9, 0.1, 0.2, 0.3]),
+    rd.Cylinder([0.3, -0.5, 0.2], 0.05, 0.4, [0.5, 0.5, 0.5, -0.5]),
+    rd.Capsule([-0.5, 0.2, 0.5], 0.05, 0.3, [0.9, 0.1, 0.0, 0.0]),
+    rd.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], [0.5, 0.6, 0]),
+    rd.PointCloud([[0.5, 0.1, 0.9], [0.4, 0.2, 0.8]]),
+]
+
+
+@pytest.mark.parametrize("extra", [{"attached": [CUP]}, {"tool": TOOL}, {"tool": TOOL, "attached": [CUP | {"link": "tool"}]}])
+def test_files_keep_tools_and_objects(extra: dict[str, Any], tmp_path: Path) -> None:
+    problem = rd.load_problem(written(tmp_path, PLAIN | extra))
+    save_problem(problem, tmp_path / "again.json")
+    again = rd.load_problem(tmp_path / "again.json")
+    assert again.robot is problem.robot, "the same content is the same robot"
+    assert {key: problem_record(again)[key] for key in extra} == {key: problem_record(problem)[key] for key in extra}
+
+
+def test_a_goal_may_name_the_tool_and_what_is_held(tmp_path: Path) -> None:
+    for frame, extra in (("tool", {"tool": TOOL}), ("cup", {"attached": [CUP]})):
+        goal = {"pose": {"frame": frame, "xyz": [0.45, 0.3, 0.3], "wxyz": [0.0, 1.0, 0.0, 0.0]}}
+        problem = rd.load_problem(written(tmp_path, PLAIN | extra | {"goal": goal}))
+        result = rd.plan(problem, time_limit=10.0)
+        assert result.path is not None, result.reason
+        assert np.allclose(problem.robot.fk(result.path.positions[-1], frame)[:3, 3], [0.45, 0.3, 0.3], atol=1e-4)
+
+
+def test_base_moves_scene_goal_and_views_into_the_bases_frame() -> None:
+    robot = rd.load_robot("panda")
+    view = rd.DepthView(np.full((4, 4), 5.0), (4, 4, 2, 2), T_WORLD_BASE)
+    goal = rd.PoseGoal("panda_hand", T_WORLD_BASE @ robot.fk(GOAL, "panda_hand"))
+    problem = rd.Problem.in_world(T_WORLD_BASE, robot, rd.Scene(WORLD_SHAPES).moved(T_WORLD_BASE), START, goal, views=[view])
+    assert isinstance(problem.goal, rd.PoseGoal)
+    assert np.allclose(problem.goal.T_base_frame, robot.fk(GOAL, "panda_hand"))
+    assert np.allclose(problem.views[0].T_base_camera, np.eye(4))
+    for shape, moved in zip(WORLD_SHAPES, problem.known_scene.shapes, strict=True):
+        assert np.allclose(shape.bounds, moved.bounds, atol=1e-9)
+
+
+def test_distances_are_the_same_in_the_world() -> None:
+    robot = rd.load_robot("panda").attach(rd.Sphere([0, 0, 0.15], 0.04, name="ball"), "panda_hand")
+    scene = rd.Scene(WORLD_SHAPES)
+    problem = rd.Problem.in_world(T_WORLD_BASE, robot, scene.moved(T_WORLD_BASE), START, GOAL)
+    standing, world = problem.robot_and_scene_in_world()
+    q = np.array(START)
+    here = ExactCollision(robot, scene).link_distances(q)
+    for there in (ExactCollision(robot, problem.scene), ExactCollision(standing, world)):
+        assert np.allclose([d.distance for d in here], [d.distance for d in there.link_distances(q)], atol=1e-6)
+    assert np.allclose(inverse(standing.fk(q, "panda_hand")) @ T_WORLD_BASE @ robot.fk(q, "panda_hand"), np.eye(4), atol=1e-12)
+
+
+def test_files_in_the_world_come_back_as_they_were_read(tmp_path: Path) -> None:
+    base = {"xyz": [0.3, -0.2, 0.7], "wxyz": [0.8, 0.0, 0.0, 0.6]}
+    record = PLAIN | {
+        "base": base,
+        "scene": [WALL | {}, {"sphere": {"center": [0.1, 0.2, 1.4], "radius": 0.1}}],
+        "goal": {"pose": {"frame": "panda_hand", "xyz": [0.4, 0.3, 1.1], "wxyz": [0.0, 1.0, 0.0, 0.0]}},
+    }
+    problem = rd.load_problem(written(tmp_path, record))
+    again = problem_record(problem_from_record(problem_record(problem)))
+    assert again == problem_record(problem)
+    assert again["base"] == base and again["goal"] == record["goal"]
+    assert again["scene"][1] == record["scene"][1]  # type: ignore[index]
+    assert np.allclose(
+        problem.scene.shapes[1].bounds.mean(0), [-0.2, 0.4, 0.7] @ np.array([[0.28, -0.96, 0], [0.96, 0.28, 0], [0, 0, 1]])
+    )
+
+
+def test_pybullet_sees_no_contact_where_the_robot_stands_in_the_world() -> None:
+    pytest.importorskip("pybullet")
+    from robotdiffuse.simulation.validator import PyBulletOracle
+
+    T = transform(np.array([0.5, 0.2, 1.5]), rotation_about(np.array([1.0, 0.0, 0.0]), np.pi))
+    robot = rd.load_robot("panda").attach(rd.Box([0, 0, 0.16], [0.05, 0.05, 0.12], name="cup"), "panda_hand")
+    wall = rd.Box([0.5, 0.0, 0.25], [0.3, 0.06, 0.3], name="wall").moved(T)
+    problem = rd.Problem.in_world(T, robot, rd.Scene([wall]), START, GOAL)
+    result = rd.plan(problem, time_limit=10.0)
+    assert result.path is not None, result.reason
+    standing, _ = problem.robot_and_scene_in_world()
+    with PyBulletOracle(standing, rd.Scene([wall])) as oracle:
+        assert oracle.check_path(result.path) is None
+        contact = oracle.check_path(rd.Path(robot.joint_names, np.array([START, GOAL])))
+        assert contact is not None and {contact.link, contact.other} <= {"cup", "wall", "panda_hand"}
+
+
+WRONG_EQUIPMENT = {
+    "base of MoveIt": ({"base": {}, "scene": "scene.yaml"}, "base cannot be combined with MoveIt files"),
+    "base": ({"base": {"euler": [0, 0, 0]}}, "unknown field of base: .euler.; known: rpy, wxyz, xyz"),
+    "tool link": ({"tool": {"xyz": [0, 0, 0]}}, "tool has no link"),
+    "unknown tool link": ({"tool": {"link": "hand"}}, "unknown link in tool.link: 'hand'"),
+    "attached nothing": ({"attached": {}}, "attached is {}; it must be a list of objects"),
+    "contacts in a list": ({"allowed_contacts": []}, "allowed_contacts is \\[\\]; it must be a mapping of obstacles"),
+    "degrees": ({"base": {"rpy": [0, 0, 90]}}, r"base.rpy \[rad\] is \[0, 0, 90\]; .* within ±6.3"),
+    "cloud as a ball": (
+        {"scene": [{"sphere": {"center": [1, 0, 0], "radius": 0.1, "file": "a.ply"}}]},
+        "unknown field of scene.*: 'file'",
+    ),
+    "attached": ({"attached": CUP}, "attached is .*; it must be a list of objects"),
+    "no link": ({"attached": [WALL]}, r"attached\[0\] is .*; it must be a shape with its link"),
+    "fixed link": ({"attached": [CUP | {"link": "panda_link0"}]}, r"attached\[0\]: attached.link: no"),
+    "twice": ({"attached": [CUP, CUP]}, r"attached\[1\]: attached.name is 'cup'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("extra", "message"), WRONG_EQUIPMENT.values(), ids=WRONG_EQUIPMENT)
+def test_wrong_equipment_is_one_line(extra: dict[str, Any], message: str, tmp_path: Path) -> None:
+    refuses(message, rd.load_problem, written(tmp_path, PLAIN | extra))
+
+
+def test_a_second_shape_of_one_name_is_noted(tmp_path: Path) -> None:
+    problem = rd.load_problem(written(tmp_path, PLAIN | {"scene": [WALL, WALL]}))
+    assert problem.notes == ("scene[1]: an earlier shape is named wall too; this one is wall_2",)
