@@ -25,27 +25,24 @@ from robotdiffuse.problems.fields import problem_schema
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.files import SHAPES
 
+PLAN = ["plan", "problem.json"]
 TRAIN = ["train", "planner", "--data", "d", "--encoder", "dgcnn", "--out", "o"]
 BAD_CALL = {
     "no command": ([], "COMMAND"),
     "unknown command": (["plna"], "did you mean plan?"),
     "missing file": (["plan", "missing.yaml"], "missing.yaml"),
-    "weights of a planner without": (
-        ["plan", "problem.json", "--planner", "rrt_connect", "--weights", "w"], "planner rrt_connect has no weights"
-    ),
-    "weights of a name that no file has": (
-        ["plan", "problem.json", "--planner", "diffusion", "--weights", "w" * 5000], "wwww... File name too long"
-    ),
-    "weights that are none": (["plan", "problem.json", "--planner", "diffusion", "--weights", "."], "holds no model"),
-    "unknown planner": (["plan", "problem.json", "--planner", "rrt"], "known: a_star, aorrtc, control"),
-    "no time": (["plan", "problem.json", "--time-limit", "0"], "time_limit is 0"),
-    "negative clearance": (["plan", "problem.json", "--clearance", "-1"], "clearance is -1.0"),
-    "unknown ending": (["plan", "problem.json", "--out", "r.xml"], "unknown ending '.xml'; known: .json"),
-    "the problem as output": (["plan", "problem.json", "--out", "./problem.json"], "problem.json is an input"),
+    "weights of a planner without": ([*PLAN, "--planner", "rrt_connect", "--weights", "w"], "rrt_connect has no weights"),
+    "weights of a name too long": ([*PLAN, "--planner", "diffusion", "--weights", "w" * 5000], "wwww... File name too long"),
+    "weights that are none": ([*PLAN, "--planner", "diffusion", "--weights", "."], "holds no model"),
+    "unknown planner": ([*PLAN, "--planner", "rrt"], "known: a_star, aorrtc, control"),
+    "no time": ([*PLAN, "--time-limit", "0"], "time_limit is 0"),
+    "negative clearance": ([*PLAN, "--clearance", "-1"], "clearance is -1.0"),
+    "unknown ending": ([*PLAN, "--out", "r.xml"], "unknown ending '.xml'; known: .json"),
+    "the problem as output": ([*PLAN, "--out", "./problem.json"], "problem.json is an input"),
     "the result as output": (["export", "problem.json", "--out", "problem.json"], "problem.json is an input"),
     "the motion as certificate": (["verify", "problem.json", "--certificate", "problem.json"], "is an input"),
-    "missing folder": (["plan", "problem.json", "--out", "no/r.json"], "the folder no does not exist"),
-    "unknown option": (["plan", "problem.json", "--tme-limit=3"], "did you mean --time-limit?"),
+    "missing folder": ([*PLAN, "--out", "no/r.json"], "the folder no does not exist"),
+    "unknown option": ([*PLAN, "--tme-limit=3"], "did you mean --time-limit?"),
     "unknown robot": (["robot", "info", "pandaa"], "pandaa"),
     "no workers": (["data", "generate", "--out", "d", "--workers", "0"], "'0' is not an integer"),
     "no folder": (["data", "generate", "--out", ""], "--out: empty"),
@@ -147,9 +144,7 @@ def test_planners_are_listed_without_loading_them_and_so_are_their_settings(said
     assert said(2, "planner", "info", "aorrt").endswith("did you mean aorrtc?\n")
 
 
-def test_a_module_of_the_current_folder_adds_planners_and_shapes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Said
-) -> None:
+def test_a_module_of_the_current_folder_adds_planners_and_shapes(tmp_path: Path, monkeypatch, said: Said) -> None:
     """Regression: results with an added shape could be planned, but not verified, drawn or exported."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
@@ -263,9 +258,7 @@ def test_bash_completes_commands_and_options(said: Said) -> None:
     assert "bashcompinit" in said(0, "completion", "zsh")
 
 
-def test_robot_add_with_srdf_and_robot_list(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], said: Said, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_robot_add_with_srdf_and_robot_list(tmp_path: Path, capsys, said: Said, monkeypatch) -> None:
     """Pairs that an SRDF or the command allows, the comparison with sampling, progress without a terminal."""
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
     monkeypatch.setattr("robotdiffuse.robots.fitting.preparation.PreparationSettings", lambda: QUICK)

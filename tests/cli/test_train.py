@@ -68,9 +68,7 @@ def test_cross_attention_without_points_is_refused_before_anything_is_made(said:
 
 
 @pytest.mark.parametrize(("config", "encoder"), [("points", "points"), ("trajectory_prior", None)])
-def test_the_encoder_of_the_config_is_that_of_an_arm_too(
-    config: str, encoder: str | None, trained: list[PlannerTraining], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_encoder_of_the_config_is_that_of_an_arm_too(config: str, encoder: str | None, trained, monkeypatch) -> None:
     monkeypatch.setattr("robotdiffuse.cli.train.generate", lambda *_, **__: None)
     assert run("train", "planner", "--robot", "panda", "--out", "o", "--config", config) == 0
     assert trained[0].encoder == encoder and not Path("o", "encoder").exists()

@@ -8,9 +8,9 @@ from numba import njit
 from numba.core.compiler_lock import global_compiler_lock
 
 import robotdiffuse as rd
-from helpers.clock import stop_clock
 from helpers.commands import python
 from helpers.panda import LEFT, PANDA, RIGHT
+from helpers.waiting import stop_clock
 from robotdiffuse.collision import exact_meshes, kernel_arrays
 from robotdiffuse.core.deadline import LONG, OutOfTimeError, check_time, check_timing, deadline
 from robotdiffuse.core.kernels import inner_kernel, kernel

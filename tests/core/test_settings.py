@@ -153,9 +153,8 @@ def test_entries_of_installed_packages_are_loaded_when_they_are_used(tmp_path: P
     package = tmp_path / "orchard-1.0.dist-info"
     package.mkdir()
     (package / "METADATA").write_text("Metadata-Version: 2.1\nName: orchard\nVersion: 1.0\n")
-    (package / "entry_points.txt").write_text(
-        "[test.fruits]\nplum = orchard:PLUM\nstone = orchard:STONE\ngone = no_such_module:GONE\n"
-    )
+    points = "[test.fruits]\nplum = orchard:PLUM\nstone = orchard:STONE\ngone = no_such_module:GONE\n"
+    (package / "entry_points.txt").write_text(points)
     entry = "from robotdiffuse.core.registry import Entry\nPLUM = Entry('pathlib:Path', 'a plum')\nSTONE = 1\n"
     (tmp_path / "orchard.py").write_text(entry)
     monkeypatch.syspath_prepend(str(tmp_path))

@@ -262,10 +262,8 @@ def test_rows_that_were_timed_under_other_loads_are_told_in_the_table(tmp_path: 
     bench = bench_comparisons.read_bench(folder)
     (section,) = bench_comparisons.sections(bench, [1.0])
     table = bench_report.main_table(section, section.main, bench.reference)
-    assert cells(table, "timed") == {
-        "robotdiffuse": "run a, 2 at once",
-        "rrt_connect": "run a, 2 at once",
-        "mpd": "run b, 1 at once",
+    assert cells(table, "timed") == dict.fromkeys(("robotdiffuse", "rrt_connect"), "run a, 2 at once") | {
+        "mpd": "run b, 1 at once"
     }
     assert "Not all rows were timed alike" in table.notes[0]
     bench = bench_comparisons.read_bench(folder, ["robotdiffuse", "rrt_connect"])

@@ -262,9 +262,7 @@ def test_furniture_among_the_families(tmp_path: Path) -> None:
         np.testing.assert_allclose(reached[:3, 3], shard["target_pose"][row, 4:], atol=1e-5)
 
 
-AORRTC = GenerationSettings(
-    mix={"rop_dense": 1.0}, goals=4, waypoints=32, trivial_share=0.0, planner="aorrtc", search=AORRTCSearchSettings()
-)
+AORRTC = replace(SETTINGS, mix={"rop_dense": 1.0}, seed=0, trivial_share=0.0, planner="aorrtc", search=AORRTCSearchSettings())
 
 
 @pytest.mark.parametrize("name", ["panda", "ur5e"])
@@ -372,9 +370,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(undisturbed, tm
 
 
 @pytest.mark.slow
-def test_a_worker_killed_from_outside_is_one_line_and_the_next_call_goes_on(
-    undisturbed: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_worker_killed_from_outside_is_one_line_and_the_next_call_goes_on(undisturbed, tmp_path, monkeypatch):
     def kill(done: int, _total: int) -> None:
         if done == MANY.shard:
             os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)

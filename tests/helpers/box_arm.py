@@ -1,13 +1,15 @@
-"""A planar arm of boxes with known geometry, for the tests of collision and of the validator."""
+"""A planar arm of boxes with known geometry, for the tests of collision and of the validator; meshes of boxes."""
 
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import trimesh
 from numpy import ndarray
 from scipy.spatial import ConvexHull
 
 from helpers.example_robots import planar_arm
+from robotdiffuse.robots.bodies import Surface
 from robotdiffuse.robots.robot import ConvexMesh, Robot
 
 HALF_WIDTH = 0.03
@@ -44,3 +46,14 @@ def box_arm(spheres: bool = True) -> Robot:
         spheres=covers if spheres else {},
         allowed_collisions=frozenset({frozenset(("l1", "l2")), frozenset(("l2", "l3"))}),
     )
+
+
+def surface(mesh: trimesh.Trimesh) -> Surface:
+    return Surface(np.array(mesh.vertices), np.array(mesh.faces))
+
+
+def boxes(*ends: tuple[tuple[float, ...], tuple[float, ...]]) -> trimesh.Trimesh:
+    """Closed boxes from their lowest to their highest corners; where they meet, there are inner walls."""
+    made = trimesh.util.concatenate([trimesh.creation.box(bounds=np.array(each)) for each in ends])
+    assert isinstance(made, trimesh.Trimesh)
+    return made

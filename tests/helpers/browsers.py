@@ -1,8 +1,11 @@
-"""The browser that tests drive."""
+"""The browser that tests drive, and the data in pages."""
 
+import json
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -27,3 +30,10 @@ def opened(url: str, width: int = 900, height: int = 600) -> Iterator[Any]:
         view.goto(url)
         yield view
         browser.close()
+
+
+def page_data(file: Path) -> Any:
+    """The data in the page of a replay."""
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', file.read_text("utf-8"), re.S)
+    assert found is not None
+    return json.loads(found[1])

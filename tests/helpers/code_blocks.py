@@ -99,7 +99,7 @@ def rop_data(folder: Path) -> None:
     shutil.copytree(_rop(folder.parent), folder / "rop")
 
 
-def arm(urdf: str, **how: str) -> None:
+def arm(urdf: str, **how: Any) -> None:
     """Prepares the robot of a URDF with few, large spheres, since `robot add` takes a minute."""
     with coarse_grids():
         add_robot(urdf, settings=QUICK, **how)

@@ -124,9 +124,7 @@ def record(robot: Robot, scene: Scene, q: ndarray, family: int = 0, line_free: b
     }
 
 
-def write_motions(
-    folder: Path, robot: Robot, rows: list[dict[str, ndarray]], shard: int = 100, waypoints: int = 20
-) -> Manifest:
+def write_motions(folder: Path, robot: Robot, rows: list[dict], shard: int = 100, waypoints: int = 20) -> Manifest:
     """Writes a data set of these rows without a floor, with this number of rows in a shard."""
     of = {"families": {name: {} for name in FAMILIES}, "floors": dict.fromkeys(FAMILIES)}
     manifest = manifest_of(robot, waypoints, trajectories=len(rows), shard=shard, **of)

@@ -82,7 +82,7 @@ def recording(file: Path, change: Callable[[dict[str, Any]], object] = lambda me
     names = list(reversed(PANDA.joint_names))
     messages: dict[str, Any] = {
         "/joint_states": [
-            {"header": {"stamp": stamp(at)}, "name": names, "position": (HOME[::-1] + at).tolist()} for at in (1.0, 1.1)
+            {"header": {"stamp": stamp(t)}, "name": names, "position": (HOME[::-1] + t).tolist()} for t in (1, 1.1)
         ],
         "/tf": [{"transforms": [pose("panda_link0", "panda_hand", at, x=at)]} for at in (1.0, 1.1)],
         "/tf_static": [{"transforms": [pose("panda_hand", "camera_optical", 0.0, x=0.5)]}],
@@ -168,9 +168,7 @@ def test_bags_of_librealsense(compression: Writer1.CompressionFormat | None, tmp
 
 
 @pytest.mark.parametrize("compression", Writer1.CompressionFormat)
-def test_small_bags_that_unpack_to_much_are_refused(
-    compression: Writer1.CompressionFormat, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_small_bags_that_unpack_to_much_are_refused(compression: Any, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("robotdiffuse.interop.ros2.MAX_UNPACKED", 10**6)
     file = realsense(tmp_path / "r.bag", compression, zeros=2 * 10**6)
     assert file.stat().st_size < 10**5

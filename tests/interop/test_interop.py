@@ -4,7 +4,6 @@ import json
 import os
 import sys
 import threading
-from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -48,9 +47,7 @@ def planned() -> Planned:
         rd.PointCloud([[-0.9, 0.0, 0.1], [-0.9, 0.1, 0.1]]),
     ]
     problem = Problem(PANDA, Scene(shapes), START, GOAL)
-    result = rd.load_planner("rrt_connect").plan(problem, time_limit=5.0)
-    assert result.trajectory is not None
-    return problem, result.trajectory
+    return problem, rd.load_planner("rrt_connect").plan(problem, time_limit=5.0).trajectory
 
 
 @pytest.mark.parametrize("ending", [ending for ending in (*WRITERS, ".csv", ".json") if ending in READERS])
@@ -350,9 +347,7 @@ def test_unknown_endings_list_the_known_ones(planned: Planned, tmp_path: Path) -
         ("roslibpy", "roslibpy", "ros", lambda: recorded_motion.publish(MOTION, "", 1, "/a", 1.0)),
     ],
 )
-def test_a_missing_extra_says_what_to_install(
-    module: str, package: str, extra: str, use: Callable[[], object], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_extra_says_what_to_install(module: str, package: str, extra: str, use, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     for name in ("ros2", "rerun_file"):
         monkeypatch.delitem(sys.modules, f"robotdiffuse.interop.{name}", raising=False)

@@ -60,9 +60,8 @@ ALONE = {
 }
 """Each cost as the only one, in steps of moderate size."""
 PANDA = rd.load_robot("panda")
-CROWDED = CollisionChecker(
-    PANDA, rd.Scene([Sphere([0.45, 0.1, 0.5], 0.2), Box([0.0, 0.5, 0.4], [0.3, 0.2, 0.3]), Sphere([-0.4, -0.3, 0.4], 0.2)])
-)
+CROWD = Sphere([0.45, 0.1, 0.5], 0.2), Box([0.0, 0.5, 0.4], [0.3, 0.2, 0.3]), Sphere([-0.4, -0.3, 0.4], 0.2)
+CROWDED = CollisionChecker(PANDA, rd.Scene(CROWD))
 
 
 def random_motions(seed: int, count: int = 4, waypoints: int = 32) -> ndarray:

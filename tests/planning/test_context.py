@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from helpers.clock import stop_clock
 from helpers.panda import HOME
+from helpers.waiting import stop_clock
 from robotdiffuse import Problem, Scene, Sphere, Status, load_planner, load_robot
 from robotdiffuse.core.deadline import TIMING, OutOfTimeError
 from robotdiffuse.planning.context import PlanningContext, PlanRequest

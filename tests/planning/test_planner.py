@@ -1,28 +1,37 @@
-"""Every planner: solved means verified, anything else has a reason; each kind of request is fulfilled or refused; seeds."""
+"""Every planner: solved means verified, anything else has a reason; each kind of request is fulfilled or refused; seeds;
+many problems at a time; continuous joints, of which values that differ by a whole turn are equal."""
 
 import inspect
 import re
+import subprocess
+import sys
 import traceback
 from dataclasses import fields, replace
 from functools import cache, partial
 from itertools import product
-from pathlib import Path
+from pathlib import Path, Path as FilePath
 from typing import Any
 
 import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.box_arm import box_arm
 from helpers.commands import python
 from helpers.panda import HOME, LEFT, PANDA, RIGHT
 from helpers.refusals import refuses
+from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.transforms import rotation_about, transform
+from robotdiffuse.interop.recorded_motion import RecordedMotion, motion_of_robot
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.planning import CLEARANCE, DEFAULT_PLANNER, PATH_CONSTRAINTS, PLANNERS, SEARCH, planners_that_support
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.problems.held_out import held_out_problem
+from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT
+from robotdiffuse.robots.parsing.urdf import with_limits
+from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.validation.report import Report, Violation
 from robotdiffuse.validation.validator import Verifier
 
@@ -275,3 +284,148 @@ def test_the_first_call_and_later_ones_give_the_same_path_although_paths_are_ref
     assert len(refusals) == refused
     assert np.array_equal(first.path.positions, later.path.positions)
     assert not np.array_equal(first.path.positions, other.positions)
+
+
+BURIED = rd.Scene([rd.Sphere([0.0, 0.0, 0.3], 0.5, name="everything")])
+
+
+def problems() -> list[rd.Problem]:
+    scenes = [rd.Scene([rd.Box([0.45, 0.0, h], [0.3, 0.05, 0.4], name="wall")]) for h in (0.2, 0.4, 0.6)]
+    return [rd.Problem(PANDA, scene, LEFT, RIGHT) for scene in [*scenes, BURIED]]
+
+
+def test_results_are_in_order_and_as_alone() -> None:
+    counts: list[tuple[int, int]] = []
+    cup = rd.Cylinder([0, 0, 0.16], 0.03, 0.12, name="cup")
+    assert list(rd.plan_many([])) == []
+    asked = problems()
+    asked.insert(1, replace(asked[0], robot=PANDA.attach(cup, "panda_hand")))
+    request: dict[str, Any] = {"settings": {"range": 0.3}, "until": "first", "time_limit": 300.0, "seed": 3}
+    results = list(rd.plan_many(asked, "aorrtc", workers=2, progress=lambda *at: counts.append(at), **request))
+    assert counts == [(done, 5) for done in range(1, 6)]
+    assert [result.status for result in results] == [rd.Status.SOLVED] * 4 + [rd.Status.INVALID_START]
+    for problem, together in zip(asked[:4], results[:4], strict=True):
+        assert np.array_equal(together.path.positions, rd.plan(problem, planner="aorrtc", **request).path.positions)
+        assert rd.verify(problem, together.path).valid
+
+
+def test_a_process_that_dies_costs_one_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = problems()[:3]
+    deadly = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.4], name="deadly")])
+    asked.insert(1, rd.Problem(PANDA, deadly, LEFT, RIGHT))
+    asked.insert(3, replace(asked[0], robot=replace(PANDA, name="unknown")))
+    monkeypatch.setitem(PLANNERS, "deadly", Entry("helpers.planners:Deadly", "dies of it", "RRTConnectSettings", SEARCH))
+    results = list(rd.plan_many(asked, "deadly", workers=1, time_limit=300.0))
+    ends = [result.status for result in results]
+    assert ends == [rd.Status.SOLVED, rd.Status.ERROR, rd.Status.SOLVED, rd.Status.ERROR, rd.Status.SOLVED]
+    assert "died" in results[1].reason and "no such robot" in results[3].reason
+
+
+def test_arguments_are_checked_at_once() -> None:
+    refuses("workers is 0", rd.plan_many, problems()[:1], workers=0)
+    refuses("unknown planner 'rrt'", rd.plan_many, problems()[:1], planner="rrt")
+    refuses("unknown argument 'time'; known: .*time_limit", rd.plan_many, problems()[:1], time=1.0)
+    refuses("unknown until .soon.", rd.plan_many, problems()[:1], until="soon")
+
+
+PLANS = """
+import robotdiffuse as rd
+panda = rd.load_robot("panda")
+middle = (panda.lower + panda.upper) / 2
+problems = [rd.Problem(panda, rd.Scene([]), middle, middle + 0.1)] * 2
+for result in rd.plan_many(problems, "rrt_connect", workers=2):
+    print(result.status.value, result.reason)
+"""
+
+
+@pytest.mark.parametrize("others", ["", "raise SystemExit", pytest.param("import os; os._exit(0)", marks=pytest.mark.slow)])
+def test_a_script_that_processes_cannot_import_is_an_error(others: str, tmp_path: Path) -> None:
+    """Regression: the call hung, since the robots for a starting process do not fit into a pipe that nobody reads."""
+    script = tmp_path / "script.py"
+    script.write_text(f'if __name__ != "__main__":\n    {others or "pass"}\n{PLANS}')
+    lines = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=500).stdout.splitlines()
+    assert len(lines) == 2 and len({*lines}) == 1
+    assert lines[0].startswith("error a worker process could not import the main script")
+    assert lines[0].endswith('below the line: if __name__ == "__main__":')
+
+
+TURNING = {"kind": "continuous", "lower": -CONTINUOUS_LIMIT, "upper": CONTINUOUS_LIMIT}
+JOINTS = tuple(replace(j, **TURNING) if j.name in ("j0", "j2") else j for j in box_arm().joints)
+ARM = replace(box_arm(), joints=JOINTS)
+POST = rd.Scene([rd.Box([-0.7, 0.0, 0.0], [0.4, 0.05, 0.2], name="post")])
+"""Where the stretched arm points at half a turn."""
+
+
+def planned(planner: str, start: list[float], goal: object, scene: rd.Scene | None = None, **more: object) -> rd.Path:
+    problem = rd.Problem(ARM, scene or rd.Scene(), start, goal)  # type: ignore[arg-type]
+    result = rd.load_planner(planner).plan(problem, time_limit=60.0, **more)  # type: ignore[arg-type]
+    assert result.solved, result.reason
+    assert rd.verify(problem, result.path).valid and rd.verify(problem, result.trajectory).valid
+    assert np.array_equal(result.path.positions[0], problem.start)
+    assert np.abs(np.diff(result.trajectory.positions, axis=0)).max() < 0.05  # no jump: 2 rad/s at rows of 10 ms
+    return result.path
+
+
+@pytest.mark.parametrize(
+    ("planner", "turns"), [("rrt_connect", 0), ("aorrtc", -5), ("robotdiffuse", 1), ("shared_tree_rrt_star", 1)]
+)
+def test_from_3_to_minus_3_is_a_short_way(planner: str, turns: int) -> None:
+    """Regression: the way was 6 rad, in place of 0.28 rad across half a turn; the start may have whole turns."""
+    start = 3.0 + 2 * np.pi * turns
+    path = planned(planner, [start, 0.0, 0.0], [-3.0, 0.0, 0.0])
+    assert path.length == pytest.approx(2 * np.pi - 6, abs=1e-6)
+    assert path.positions[-1, 0] == pytest.approx(start + 2 * np.pi - 6)
+
+
+def test_a_pose_is_reached_across_half_a_turn_and_the_long_way_where_something_blocks_the_short_one() -> None:
+    assert planned("aorrtc", [2.9, 0.5, 0.2], rd.PoseGoal("tip", ARM.fk([-2.9, 0.5, 0.2], "tip"))).length < 0.6
+    path = planned("aorrtc", [2.8, 0.0, 0.0], [-2.8, 0.0, 0.0], POST)
+    assert path.positions[-1, 0] == pytest.approx(-2.8) and path.length > 5.5
+
+
+def test_values_wrapped_to_half_a_turn_are_no_motion_but_those_of_a_file_are_unwrapped() -> None:
+    """Regression: a path with wrapped values was valid, the long way round; with times, its rows turned at 1571 rad/s."""
+    problem = rd.Problem(ARM, rd.Scene(), [3.0, 0.0, 0.0], [-3.0, 0.0, 0.0])
+    motion = rd.load_planner("aorrtc").plan(problem).trajectory
+    wrapped = (motion.positions + np.pi) % (2 * np.pi) - np.pi
+    for rows in (rd.Path(ARM.joint_names, wrapped), replace(motion, positions=wrapped)):
+        violation = rd.verify(problem, rows).violation
+        assert violation.kind == "jump" and violation.subject == "j0"
+        assert "unwrap" in violation.message
+    for times in (None, motion.times):
+        velocities = None if times is None else motion.velocities
+        read = motion_of_robot(RecordedMotion(ARM.joint_names, wrapped, times, velocities), ARM)
+        assert isinstance(read.motion, rd.Path if times is None else rd.Trajectory)
+        assert read.notes[0] == "values of j0 jump by whole turns; they were unwrapped"
+        assert np.allclose(read.motion.positions, motion.positions)
+        assert rd.verify(problem, read.motion).valid
+
+
+def test_images_of_a_goal() -> None:
+    start = np.array([3.0, 1.0, -0.2])
+    nearest, first, last = ARM.turned_both_ways(np.array([-3.0 - 4 * np.pi, -1.0, 0.2]), start, ARM.continuous)
+    np.testing.assert_allclose(nearest, [2 * np.pi - 3, -1.0, 0.2])
+    np.testing.assert_allclose(first, [-3.0, -1.0, 0.2])
+    np.testing.assert_allclose(last, [2 * np.pi - 3, -1.0, 0.2 - 2 * np.pi])
+    assert len(box_arm().turned_both_ways(start, start, box_arm().continuous)) == 1
+    assert (np.abs([nearest, first, last]) <= CONTINUOUS_LIMIT).all()
+
+
+def test_elbows_that_cannot_fold_through_reach_a_goal_on_the_other_side() -> None:
+    """Regression: if two elbows on continuous joints had to turn back by way of zero, no goal let both do so: no path."""
+    start = np.array([3.0, 1.0, 3.0])
+    rows = ARM.turned_both_ways(-start, start, ARM.continuous)
+    np.testing.assert_allclose(rows[[0, -1]], np.stack([np.array([2 * np.pi - 3, -1.0, 2 * np.pi - 3]), -start]))
+    assert len(rows) == 4
+
+
+def test_limits_of_a_continuous_joint(tmp_path: FilePath) -> None:
+    """Limits make it revolute, as the validator checks none of continuous ones; in robot folders it has those of planning."""
+    assert rd.Problem(ARM, rd.Scene(), [50.0, 0.0, 0.0], [0.0, 0.0, 0.0]).start[0] == 50.0
+    narrow = with_limits(ARM, {"j0": {"lower": -1.0}})
+    assert (narrow.planned_joints[0].kind, narrow.lower[0], narrow.upper[0]) == ("revolute", -1.0, np.pi)
+    refuses("j0 is 50 rad; its limits are -1", rd.Problem, narrow, rd.Scene(), [50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    joints = tuple(replace(j, lower=-np.pi, upper=np.pi) if j.name == "j0" else j for j in ARM.joints)
+    write_robot_folder(replace(ARM, joints=joints), tmp_path, {})
+    robot = read_robot_folder(tmp_path)
+    assert robot.planned_joints[0].kind == "continuous" and robot.upper[0] == CONTINUOUS_LIMIT

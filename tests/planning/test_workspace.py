@@ -266,9 +266,8 @@ def test_joined_motions_keep_the_limits_of_the_call() -> None:
     there = space.plan("extended", "ready", time_limit=10.0)
     back = space.plan("ready", there.path.positions[-1], time_limit=10.0)
     for blend in (0.0, 0.2):
-        motion = rd.join(
-            [there, back], blend, time_limit=20.0, velocity_scaling=0.4, acceleration_scaling=0.2, jerk=80.0
-        ).trajectory
+        limits = {"velocity_scaling": 0.4, "acceleration_scaling": 0.2, "jerk": 80.0}
+        motion = rd.join([there, back], blend, time_limit=20.0, **limits).trajectory
         assert (np.abs(motion.velocities) <= 0.4 * PANDA.velocity * (1 + 1e-6)).all()
         assert (np.abs(motion.accelerations) <= 0.2 * PANDA.acceleration * (1 + 1e-6)).all()
         assert (motion.peak_jerks <= 80.0 * (1 + 1e-6)).all()

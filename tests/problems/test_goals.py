@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from numpy import ndarray
 from scipy.interpolate import CubicHermiteSpline
-from scipy.spatial.transform import Rotation
 
 import robotdiffuse as rd
 from helpers.commands import written
 from helpers.refusals import refuses
-from robotdiffuse.core.transforms import inverse, rotation_from_rpy, rpy_from_rotation, transform
+from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.validation.tolerances import goal_error
 from robotdiffuse.validation.validator import verify_trajectory
@@ -27,13 +26,6 @@ TABLE = {"box": {"center": [0.55, 0, 0.1], "size": [0.5, 1.0, 0.2], "wxyz": [0.9
 AHEAD = transform(np.array([0.5, 0.0, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
 WIDE = rd.PoseGoal("panda_hand", AHEAD, [0.0, 0.35, 0.0], [0.0, 0.0, np.pi])
 DOWN = transform(np.array([0.45, 0.3, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
-
-
-def test_rpy_of_a_rotation_is_scipys() -> None:
-    for rotation in Rotation.random(50, np.random.default_rng(0)):
-        matrix = rotation.as_matrix()
-        assert np.allclose(rpy_from_rotation(matrix), rotation.as_euler("xyz"), atol=1e-9)
-        assert np.allclose(rotation_from_rpy(*rpy_from_rotation(matrix)), matrix)
 
 
 def off(goal: rd.PoseGoal, xyz: Any, rpy: Any) -> bool:

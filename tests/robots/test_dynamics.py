@@ -79,7 +79,6 @@ def test_motions_with_a_payload_are_slower_and_keep_the_limits() -> None:
 def test_the_validator_names_joint_torque_and_limit() -> None:
     free = rd.Problem(PANDA, rd.Scene(), LOW, FAR)
     result = rd.plan(free, time_limit=10.0)
-    assert result.trajectory is not None
     found = verify_trajectory(replace(free, payload=rd.Payload(3.0, [0.0, 0.0, 0.1])), result.trajectory).violation
     assert found is not None and found.kind == "torque" and found.subject == "panda_joint2"
     assert found.message.endswith("N m, its effort limit is 87 N m, with the payload")

@@ -12,6 +12,7 @@ from hypothesis import given, strategies as st
 import robotdiffuse as rd
 from helpers.example_robots import TIPS, example_robot, planar_arm, urdf_file
 from helpers.refusals import refuses
+from helpers.sphere_oracles import with_spheres
 from robotdiffuse.core.transforms import rotation_angle, transform
 from robotdiffuse.learning.training.losses import ForwardKinematics
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
@@ -101,14 +102,6 @@ def test_inverse_kinematics_of_a_robot_nearest_first() -> None:
     refuses("unknown link 'moon'", panda.jacobian, q, "moon")
 
 
-def with_spheres(robot: rd.Robot) -> rd.Robot:
-    """The robot with three random spheres on each link but the second, which has none."""
-    rng = np.random.default_rng(5)
-    links = [link for link in robot.link_names if link != robot.link_names[1]]
-    spheres = {link: np.hstack([rng.uniform(-0.1, 0.1, (3, 3)), rng.uniform(0, 0.05, (3, 1))]) for link in links}
-    return replace(robot, spheres=spheres)
-
-
 def sampled_radii(robot: rd.Robot, count: int) -> np.ndarray:
     """Largest distances over random configurations, many of them with joints at a limit."""
     rng = np.random.default_rng(1)
@@ -130,7 +123,7 @@ def sampled_radii(robot: rd.Robot, count: int) -> np.ndarray:
 
 @pytest.mark.parametrize("name", TIPS)
 def test_never_below_and_close_to_sampled_maxima(name: str) -> None:
-    robot = with_spheres(example_robot(name))
+    robot = with_spheres(name)
     radii = motion_radii(robot)
     sampled = sampled_radii(robot, 20_000)
     assert (radii >= sampled).all()

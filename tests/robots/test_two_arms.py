@@ -197,9 +197,8 @@ def test_reach_is_that_of_the_arm_that_moves_and_does_not_depend_on_the_mounting
         mounted = robot.placed_in_world(rd.pose([1, 2, 3], rpy=[1.2, 0.4, -0.3]))
         assert mounted.reach == pytest.approx(robot.reach, rel=1e-9)
     held = {name: 0.0 for name in two_arms().joint_names if name.startswith("left")}
-    assert two_arms().with_locked(held).reach == pytest.approx(
-        replace(two_arms(), tip="right_hand", other_tips=()).reach, rel=0.01
-    )
+    right = replace(two_arms(), tip="right_hand", other_tips=())
+    assert two_arms().with_locked(held).reach == pytest.approx(right.reach, rel=0.01)
 
 
 def test_the_shoulder_of_one_joint_is_the_joint(tmp_path: Path) -> None:

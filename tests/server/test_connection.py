@@ -136,9 +136,7 @@ LATE = (b"HTTP/1.1 408", b"took more than 0.05 s", True)
     ],
     ids=["half a head", "half a body", "silence", "being answered", "a client that does not read"],
 )
-def test_slow_clients_are_answered_and_disconnected(
-    sent: bytes, stuck: bool, expected: tuple[bytes, bytes, bool], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_slow_clients_are_answered_and_disconnected(sent: bytes, stuck: bool, expected, monkeypatch) -> None:
     monkeypatch.setattr(connection, "READ_TIMEOUT", 0.05)
     monkeypatch.setattr(connection, "WRITE_TIMEOUT", 0.05)
     start, holds, ends = expected

@@ -1,6 +1,5 @@
 """PyBullet, which shares no code with ours: replays, the command `simulate`; distances and verdicts agree with Coal."""
 
-import sys
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path as FilePath
@@ -138,14 +137,6 @@ def test_command(tmp_path: FilePath, said: Said) -> None:
     file = result_file(tmp_path, rd.Scene([rd.Sphere(end, 0.05)]))
     printed = said(1, "simulate", file)
     assert "panda: contact" in printed and "panda_hand" in printed and "sphere" in printed
-
-
-def test_command_without_pybullet(tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch, said: Said) -> None:
-    file = result_file(tmp_path, rd.Scene())
-    for name in [name for name in sys.modules if name.startswith("robotdiffuse.simulation")]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "pybullet", None)
-    assert 'pip install "robotdiffuse[sim]"' in said(2, "simulate", file)
 
 
 def test_moving_obstacles_are_contacts_where_the_validator_refuses_the_motion() -> None:

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from helpers.browsers import CHROMIUM, opened
+from helpers.browsers import CHROMIUM, opened, page_data
 from helpers.explorations import FLOOR, recorded
-from helpers.pages import page_data
 from helpers.refusals import refuses
 from robotdiffuse.perception.voxel_grid import MAP
 from robotdiffuse.visualization import exploration
@@ -87,9 +86,8 @@ def test_the_page_holds_what_was_known_at_each_time(page: Path) -> None:
         assert one["time"] == pytest.approx(record.begins + number * exploration.READING_TIME, abs=1e-3)
         assert one["title"].startswith(f"{number + 1}  ") and one["reason"] == record.step.reason
         assert bool(one["look"]) == (record.T_base_camera is not None) == (one["end"] is not None)
-    assert data["times"][-1] == pytest.approx(
-        explorer.duration + exploration.READING_TIME * (len(explorer.steps) - 1), abs=1e-3
-    )
+    reading = exploration.READING_TIME * (len(explorer.steps) - 1)
+    assert data["times"][-1] == pytest.approx(explorer.duration + reading, abs=1e-3)
     times = [known["time"] for known in told["known"]]
     assert times == sorted(times) and times[0] == 0.0
     unknown: set[int] = set()

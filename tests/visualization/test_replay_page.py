@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from helpers.pages import page_data
+from helpers.browsers import page_data
 from helpers.panda import GOAL, PANDA, START
 from helpers.refusals import refuses
 from robotdiffuse.core.transforms import transform

@@ -14,7 +14,9 @@ import time
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cache
+from http.client import HTTPException, HTTPResponse
 from pathlib import Path as FilePath
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -252,40 +254,18 @@ def _error(record: Any) -> str:
 
 def _read(client: socket.socket, stream: Any, until: float, head: bool) -> Answer | None:
     """The next answer; None if the connection is closed before an answer begins."""
-
-    def line() -> bytes:
-        client.settimeout(max(until - time.monotonic(), 0.001))
-        return stream.readline()
-
+    client.settimeout(max(until - time.monotonic(), 0.001))
+    # more answers may come from the stream, which HTTPResponse would close
+    open_stream = SimpleNamespace(read=stream.read, readline=stream.readline, readinto=stream.readinto, close=lambda: None)
+    response = HTTPResponse(SimpleNamespace(makefile=lambda _: open_stream), method="HEAD" if head else None)  # type: ignore
     try:
-        while True:
-            first = line()
-            if not first:
-                return None
-            headers = {}
-            while (row := line()).strip():
-                name, _, value = row.partition(b":")
-                headers[name.lower()] = value.strip()
-            status = int(first.split()[1])
-            if status >= 200 or status == 101:
-                break
-        kind = headers.get(b"content-type", b"")
-        if head:
-            return Answer(status, kind, b"")
-        if headers.get(b"transfer-encoding") == b"chunked":
-            body = b""
-            while size := int(line(), 16):
-                body += stream.read(size)
-                line()
-            line()
-            return Answer(status, kind, body)
-        length = headers.get(b"content-length")
-        return Answer(status, kind, stream.read(-1 if length is None else int(length)))
+        response.begin()
+        return Answer(response.status, response.headers.get("Content-Type", "").encode(), response.read())
     except TimeoutError:
         raise WrongError(f"no answer within {LIMIT:g} s") from None
     except ConnectionError:
         return None
-    except (ValueError, KeyError, IndexError) as error:
+    except (ValueError, HTTPException) as error:
         raise WrongError(f"no HTTP: {error}") from None
 
 

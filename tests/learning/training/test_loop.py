@@ -14,10 +14,8 @@ from robotdiffuse.learning.training.loop import TrainingRun, train
 
 
 def run_of(folder: Path, factor: Callable[[int], float]) -> TrainingRun:
-    settings = EncoderTraining(
-        minutes=None, samples=40, batch=1, warmup_steps=1, checkpoint_seconds=0.0, average=0.9, bad_steps=3
-    )
-    return TrainingRun(ToyTask(settings, factor), str(folder))
+    short = {"minutes": None, "samples": 40, "batch": 1, "warmup_steps": 1, "checkpoint_seconds": 0.0}
+    return TrainingRun(ToyTask(EncoderTraining(average=0.9, bad_steps=3, **short), factor), str(folder))
 
 
 def test_losses_that_are_not_finite_are_skipped(tmp_path: Path) -> None:

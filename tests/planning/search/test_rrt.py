@@ -153,10 +153,8 @@ def test_simplification_keeps_ends_and_freedom_and_does_not_lengthen() -> None:
         state = random_state(seed)
         trees = rrt_kernel.make_trees(*ENDS, 5_000)
         path = rrt_kernel.search(space, None, trees, rrt_kernel.INFINITE, np.float32(1.0), 100_000, state)
-        simplified = [
-            tighten(space, simplify(space, path, rounds), tries, state) for rounds, tries in ((0, 0), (1, 0), (4, 10), (1, 300))
-        ]
-        for short in simplified:
+        for rounds, tries in ((0, 0), (1, 0), (4, 10), (1, 300)):
+            short = tighten(space, simplify(space, path, rounds), tries, state)
             assert np.array_equal(short[[0, -1]], path[[0, -1]])
             assert path_length(short) <= path_length(path) + 1e-4
             assert motions_free(space, short).all()

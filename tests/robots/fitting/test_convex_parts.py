@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from helpers.boxes import boxes, surface
+from helpers.box_arm import boxes, surface
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting import convex_parts
 from robotdiffuse.robots.fitting.triangles import split

@@ -9,7 +9,7 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.awkward_urdfs import REFUSED, WORKS
-from helpers.boxes import boxes
+from helpers.box_arm import boxes
 from helpers.made_arms import BALL, chain, joint, link, row, written
 from helpers.quick_preparation import QUICK, coarse_grids
 from helpers.refusals import refuses

@@ -236,9 +236,7 @@ def test_a_model_with_other_exclusions_or_keyframes_is_another_robot(tmp_path: P
     assert len(set(digests)) == 3
 
 
-def test_reading_a_model_neither_warns_nor_writes_a_log(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
-) -> None:
+def test_reading_a_model_neither_warns_nor_writes_a_log(tmp_path: Path, monkeypatch, recwarn) -> None:
     """Regression: MuJoCo's warnings were shown as Python's, or written to MUJOCO_LOG.TXT in the user's folder."""
     monkeypatch.chdir(tmp_path)
     Path("cloth.xml").write_text(NAMED.format("").replace("<worldbody>", "<worldbody>" + CLOTH.format("")))
