@@ -96,6 +96,11 @@ def test_a_pose_by_quaternion_and_by_rpy_is_scipys_and_wrong_ones_are_refused() 
             np.testing.assert_array_equal(T[:3, 3], xyz)
             np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
     np.testing.assert_array_equal(rd.pose([1, 2, 3])[:3, :3], np.eye(3))
+    for pitch in (-np.pi / 2, np.pi / 2):  # gimbal lock
+        R = rd.pose(xyz, rpy=[0.3, pitch, -1.1])[:3, :3]
+        roll, *others = rpy_from_rotation(R)
+        assert roll == 0.0
+        np.testing.assert_allclose(rd.pose(xyz, rpy=[roll, *others])[:3, :3], R, atol=1e-9)
     refuses("pose has wxyz and rpy; give one of them", rd.pose, [0, 0, 0], wxyz=[1, 0, 0, 0], rpy=[0, 0, 0])
     refuses(r"pose.rpy \[rad\] is \[0, 0\]; it must be 3 finite numbers", rd.pose, [0, 0, 0], rpy=[0, 0])
     refuses("a quaternion must not be zero", rd.pose, [0, 0, 0], wxyz=[0, 0, 0, 0])
