@@ -436,9 +436,9 @@ class Planner:
 
     def _check_mask(self, mask: Any) -> None:
         flags = np.ravel(() if mask is None else mask)
-        held = [name for name, flag in zip(self.joint_names, flags, strict=False) if flag]
-        if not {*held}.isdisjoint(self.robot.joint_names):
-            raise InputError(f"mask holds {', '.join(held)}; planned joints cannot be held")
+        masked_joints = [name for name, flag in zip(self.joint_names, flags, strict=False) if flag]
+        if not {*masked_joints}.isdisjoint(self.robot.joint_names):
+            raise InputError(f"mask holds {', '.join(masked_joints)}; planned joints cannot be held")
 
     def _hold(self, shape: RigidShape, art_name: Any = None, link_id: Any = -1) -> None:
         # the third argument of MPlib 0.1 is link_id
@@ -457,14 +457,14 @@ def matrix(value: Any) -> ndarray:
     """The homogeneous transform of a pose: an object with `p` and `q`, seven numbers, or 4 x 4 numbers."""
     if hasattr(value, "p") and hasattr(value, "q"):
         value = [*np.ravel(value.p), *np.ravel(value.q)]
-    given = _array(value)
-    if given.shape == (4, 4):
-        return rigid_transform("pose", given)
-    if given.size != 7:
+    array = _array(value)
+    if array.shape == (4, 4):
+        return rigid_transform("pose", array)
+    if array.size != 7:
         raise InputError(
             f"pose is {shown(value)}; it must be x, y, z and a quaternion w, x, y, z, or 4 x 4 numbers"
         )
-    flat = given.ravel()
+    flat = array.ravel()
     return pose(flat[:3], wxyz=flat[3:])
 
 
@@ -492,15 +492,15 @@ def _limited(robot: Robot, velocity: ArrayLike | None, acceleration: ArrayLike |
     """The robot with these limits of its planned joints, and the jerk limits that follow from RAMP_TIME.
     Without limits, velocities are limited to 1, and accelerations as before."""
     rows = []
-    for field, given, usual in (
+    for field, argument, usual in (
         ("velocity", velocity, np.ones(robot.dof)),
         ("acceleration", acceleration, robot.acceleration),
     ):
-        values = np.ravel(_array(usual if given is None or not np.size(given) else given))
+        values = np.ravel(_array(usual if argument is None or not np.size(argument) else argument))
         if len(values) != robot.dof or not ((values > 0) & (values < inf)).all():
             raise InputError(
-                f"{field} limits are {shown(given)}; they must be {robot.dof} positive numbers, one for each "
-                "planned joint"
+                f"{field} limits are {shown(argument)}; they must be {robot.dof} positive numbers, one for "
+                "each planned joint"
             )
         rows.append(tuple(values.tolist()))
     return _with_limits(robot, *rows)
@@ -511,8 +511,8 @@ def _with_limits(robot: Robot, velocity: tuple[float, ...], acceleration: tuple[
     """The same object for equal limits, since arrays for collision checks are computed once for each robot:
     ManiSkill makes a planner for each episode."""
     limits = {
-        name: {"velocity": speed, "acceleration": most, "jerk": most / RAMP_TIME}
-        for name, speed, most in zip(robot.joint_names, velocity, acceleration, strict=True)
+        name: {"velocity": v, "acceleration": a, "jerk": a / RAMP_TIME}
+        for name, v, a in zip(robot.joint_names, velocity, acceleration, strict=True)
     }
     return with_limits(robot, limits)
 

@@ -182,7 +182,7 @@ def lock_folder(out: Path) -> Iterator[None]:
 
     Raises InputError if another process holds the lock or the folder cannot be made or written into.
     """
-    made = [folder for folder in (out, *out.parents) if not folder.exists()]
+    new_folders = [folder for folder in (out, *out.parents) if not folder.exists()]
     with writing(out):
         try:
             out.mkdir(parents=True, exist_ok=True)
@@ -203,5 +203,5 @@ def lock_folder(out: Path) -> Iterator[None]:
     finally:
         os.close(folder)
         with suppress(OSError):  # one is not empty
-            for empty in made:
+            for empty in new_folders:
                 empty.rmdir()

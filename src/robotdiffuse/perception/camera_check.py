@@ -131,8 +131,8 @@ def mistakes(view: DepthView) -> Iterator[tuple[str, DepthView]]:
         ("quaternion w x y z that was read as x y z w", np.roll(wxyz, -1)),
     ):
         poses[f"T_base_camera has a {name}"] = pose(T[:3, 3], wxyz=quaternion)
-    for name, other in poses.items():
-        yield name, replace(view, T_base_camera=other)
+    for name, T_corrected in poses.items():
+        yield name, replace(view, T_base_camera=T_corrected)
     fx, fy, cx, cy = view.intrinsics
     height, width = view.depth.shape
     center = (width - 1) / 2, (height - 1) / 2
@@ -162,8 +162,8 @@ def _camera_note(view: DepthView, robot: Robot, joint_values: tuple[float, ...])
         return ""
     best = ""
     highest = max(MIN_NAMED, BETTER * agreed if count >= MIN_CELLS else 0.0)
-    for name, other in mistakes(view):
-        cells, arm = _images(other, robot, q)
+    for name, corrected in mistakes(view):
+        cells, arm = _images(corrected, robot, q)
         agrees, _, other_count = _compared(cells, arm)
         if other_count < MIN_CELLS or agrees <= highest:
             continue

@@ -248,13 +248,13 @@ def empty_regions(
         is_empty[border] = True
     too_near = half < TOO_NEAR if arm is None else (half < TOO_NEAR) & ~arm[::2, ::2]
     # for each region, the number of returns beside it, and the number of those that are too near
-    beside = np.zeros((2, len(is_empty)))
+    returns_beside = np.zeros((2, len(is_empty)))
     for labels, seen, close in ((regions, ~lost, too_near), (regions.T, ~lost.T, too_near.T)):
         for own, neighbor in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None))):
             returns = seen[neighbor]
             for row, weights in enumerate((None, close[neighbor][returns])):
-                beside[row] += np.bincount(labels[own][returns], weights, len(is_empty))
-    is_empty &= beside[1] < NEAR_SHARE * beside[0]
+                returns_beside[row] += np.bincount(labels[own][returns], weights, len(is_empty))
+    is_empty &= returns_beside[1] < NEAR_SHARE * returns_beside[0]
     is_empty[0] = False
     height, width = depth.shape
     empty = is_empty[regions].repeat(2, 0).repeat(2, 1)

@@ -284,8 +284,8 @@ def seen_points(views: Sequence[DepthView], robot: Robot, start: Configuration) 
             focal = min(
                 (0.0 if view.cloud is not None else view.intrinsics[0] for view in views), default=0.0
             )
-            enough = (CELL * focal / CAMERA_DISTANCE) ** 2 >= MIN_CELL_POINTS**2
-            min_points = np.float32(MIN_CELL_POINTS if enough else 1)
+            is_dense = (CELL * focal / CAMERA_DISTANCE) ** 2 >= MIN_CELL_POINTS**2
+            min_points = np.float32(MIN_CELL_POINTS if is_dense else 1)
             supported_cells = supported(keys, row_of, sums, count, min_points)
             return sums[:count, :3][supported_cells] / sums[:count, 3:][supported_cells]
         capacity *= 4

@@ -264,8 +264,8 @@ def plan_steps(
         q = Problem(space.robot, Scene(), start, start).start
     outcome = planned(0, space, q, ())
     if outcome is None:
-        tried = f"; {tried_ends} ends of earlier steps were tried" if tried_ends > 1 else ""
-        outcome = replace(furthest, reason=furthest.reason + tried, planning_time=clock() - began)
+        attempts_text = f"; {tried_ends} ends of earlier steps were tried" if tried_ends > 1 else ""
+        outcome = replace(furthest, reason=furthest.reason + attempts_text, planning_time=clock() - began)
     return outcome
 
 

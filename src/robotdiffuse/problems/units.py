@@ -30,8 +30,10 @@ def unit_notes(problem: Problem) -> tuple[str, ...]:
     too far away). If there is none, and no view or moving obstacle, one on all obstacles if none is in
     reach."""
     reach = reach_bound(problem.robot)
-    given = [shape for shape in problem.scene.shapes if not isinstance(shape, (SeenPoints, AssumedPoints))]
-    shapes = [shape for shape in given if not isinstance(shape, PointCloud) or len(shape.points)]
+    obstacles = [
+        shape for shape in problem.scene.shapes if not isinstance(shape, (SeenPoints, AssumedPoints))
+    ]
+    shapes = [shape for shape in obstacles if not isinstance(shape, PointCloud) or len(shape.points)]
     bounds = np.array([shape.bounds for shape in shapes]).reshape(-1, 2, 3)
     extents = bounds[:, 1] - bounds[:, 0]
     of_views = (_view_note(i, view, reach) for i, view in enumerate(problem.views))
@@ -42,7 +44,7 @@ def unit_notes(problem: Problem) -> tuple[str, ...]:
         not messages
         and len(distances)
         and distances.min() > reach
-        and len(given) == len(problem.scene.shapes)
+        and len(obstacles) == len(problem.scene.shapes)
         and not (problem.views or problem.moving)
     ):
         count = len(distances)

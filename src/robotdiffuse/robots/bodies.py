@@ -151,16 +151,16 @@ class Payload(EqualByContent):
 
     def __post_init__(self) -> None:
         for name, shape, lower in (("mass", (), 0.0), ("com", (3,), -MAX_COORDINATE), ("moments", (3,), 0.0)):
-            given = getattr(self, name)
-            value = numbers(given)
+            argument = getattr(self, name)
+            value = numbers(argument)
             if (
                 value is None
                 or value.shape != shape
                 or not ((value >= lower) & (value <= MAX_COORDINATE)).all()
             ):
-                wanted = "a number of kg" if name == "mass" else "3 numbers"
+                expected = "a number of kg" if name == "mass" else "3 numbers"
                 raise InputError(
-                    f"payload.{name} is {shown(given)}; it must be {wanted} from {lower:g} to "
+                    f"payload.{name} is {shown(argument)}; it must be {expected} from {lower:g} to "
                     f"{MAX_COORDINATE:g}"
                 )
             object.__setattr__(self, name, value if shape else float(value))

@@ -401,7 +401,8 @@ class KinematicTree(Value):
         reached = []
         chains = [*map(self.chain, self.tips)]
         for tip, chain in zip(self.tips, chains, strict=True):
-            if any({*chain} < {*other} for other in chains):  # all joints of this arm alone are locked
+            # all joints of this arm alone are locked
+            if any({*chain} < {*longer_chain} for longer_chain in chains):
                 continue
             offsets = self.frame_offsets[list(chain[:2])]
             axis, origin = offsets[0, :3, 2:].T

@@ -116,8 +116,8 @@ def time_parameterize(
     waypoints = path.positions[rows]
     if len(rows) == 1:
         rows = spline_rows(path.positions[[0, -1]], settings.sample_time)
-        short = within_limits(Trajectory(path.joint_names, *rows), robot, settings)
-        return Timing(waypoints, np.zeros(0), short)
+        motion = within_limits(Trajectory(path.joint_names, *rows), robot, settings)
+        return Timing(waypoints, np.zeros(0), motion)
     allowed = np.full(len(rows), settings.corner_deviation) if deviations is None else deviations[rows]
     allowed[np.searchsorted(rows, stops, side="right") - 1] = 0.0
     deviations = _shrunk(waypoints, allowed[1:-1], keeps, MIN_DEVIATION)

@@ -618,15 +618,15 @@ class _Validation:
         """Validate and time a path, and make its result the best one if it is better; None if it is
         refused."""
         search = self.search
-        wanted = self.context.clearance
+        clearance = self.context.clearance
         notes = (
-            f"no path was found with a clearance of {100 * wanted:.2g} cm; "
+            f"no path was found with a clearance of {100 * clearance:.2g} cm; "
             f"this one was searched with {100 * search.clearance:.2g} cm",
         )
         result = self.context.finish(
             path,
             stage,
-            notes=notes if search.clearance < wanted else (),
+            notes=notes if search.clearance < clearance else (),
             keeps=search.keeps_clearance,
             deviations=deviations,
         )

@@ -50,11 +50,11 @@ def _split(triangles, squares, reach):
         # where to cut the longest edge, as a fraction of it from its end beside the shortest edge
         after = edges[(k + 1) % 3]
         before = edges[(k + 2) % 3]
-        narrow = min(after, before)
-        middle = (narrow + longest_square - max(after, before)) / 2
+        shortest_square = min(after, before)
+        middle = (shortest_square + longest_square - max(after, before)) / 2
         longest = np.sqrt(longest_square)
-        at = max(middle / longest, np.sqrt(limits[t]) - np.sqrt(narrow)) / longest
-        if narrow > limits[t] or 4 * at * at * longest_square < limits[t]:
+        at = max(middle / longest, np.sqrt(limits[t]) - np.sqrt(shortest_square)) / longest
+        if shortest_square > limits[t] or 4 * at * at * longest_square < limits[t]:
             at = 0.5
         at = min(at, 0.5) if before < after else 1 - min(at, 0.5)
         # one piece in place of the triangle, the other one at the end

@@ -440,8 +440,8 @@ class UrdfTree:
         if joint.kind == "continuous":  # its position limits are ignored
             largest = {"velocity": MAX_RATE}
         limits = {
-            name: float(self._numbers(attributes[name], 1, f"joint {joint.name}: {name} limit", most)[0])
-            for name, most in largest.items()
+            name: float(self._numbers(attributes[name], 1, f"joint {joint.name}: {name} limit", bound)[0])
+            for name, bound in largest.items()
             if name in attributes
         }
         if joint.kind == "continuous":

@@ -506,9 +506,9 @@ def uploaded_problem(content: bytes, name: str, robot: Robot) -> Problem:
     robots: dict[Any, Robot] = {}
     try:
         if named_robot is not None:
-            known = known_robots()
-            if named_robot not in (*known, robot.source):
-                raise unknown_name("robot", named_robot, known)
+            names = known_robots()
+            if named_robot not in (*names, robot.source):
+                raise unknown_name("robot", named_robot, names)
             robots[named_robot] = load_robot(str(named_robot))
         return problem_from_record(data, robots)
     except InputError as error:
