@@ -324,7 +324,7 @@ def test_a_process_that_dies_costs_one_problem(monkeypatch: pytest.MonkeyPatch) 
 def test_arguments_are_checked_at_once() -> None:
     refuses("workers is 0", rd.plan_many, problems()[:1], workers=0)
     refuses("unknown planner 'rrt'", rd.plan_many, problems()[:1], planner="rrt")
-    refuses("unknown argument 'time'; known: .*time_limit", rd.plan_many, problems()[:1], time=1.0)
+    refuses("unknown argument 'time'; known: .*time_limit.*workers", rd.plan_many, problems()[:1], time=1.0)
     refuses("unknown until .soon.", rd.plan_many, problems()[:1], until="soon")
 
 

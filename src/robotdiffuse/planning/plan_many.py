@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import as_completed
 from contextlib import closing
 from dataclasses import fields, replace
+from inspect import signature
 from numbers import Integral
 from typing import Any
 
@@ -86,10 +87,9 @@ def plan_many(
         check_problem(problem, f"problems[{i}]")
     if workers is not None and not (isinstance(workers, Integral) and workers >= 1):
         raise InputError(f"workers is {shown(workers)}; it must be a whole number, at least 1")
-    arguments = {field.name for field in fields(PlanRequest)}
-    unknown = set(request) - arguments
-    if unknown:
-        raise InputError(f"unknown argument {shown(min(unknown))}; known: {', '.join(sorted(arguments))}")
+    options = [*signature(plan_many).parameters][1:-1]  # without the problems and `request`
+    for name in request:
+        check_name("argument", name, [*options, *(field.name for field in fields(PlanRequest))])
     load_planner(planner, settings, weights)
     if cluster is not None:
         check_name("cluster", cluster, CLUSTERS)
