@@ -1,5 +1,6 @@
 """The words of messages."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -24,3 +25,10 @@ def test_a_package_that_is_installed_but_broken_is_not_called_missing() -> None:
 def test_a_tensor_with_gradients_is_refused_in_one_line() -> None:
     """Regression: it was PyTorch's RuntimeError."""
     refuses(r"box.center is .*requires_grad=True", rd.Box, torch.zeros(3, requires_grad=True), [1, 1, 1])
+
+
+def test_masked_numbers_are_missing() -> None:
+    """Regression: the numbers that a mask hides were used in silence, as goals and as measured depths."""
+    hidden = np.ma.masked_array([0.5, 0.0, 9.0], [False, False, True])
+    refuses(r"sphere.center is \[0.5, 0.0, None\]; it must be 3 finite numbers", rd.Sphere, hidden, 0.1)
+    np.testing.assert_array_equal(rd.DepthView(hidden[None], (3, 3, 1, 0), np.eye(4)).depth, [[0.5, 0.0, np.nan]])

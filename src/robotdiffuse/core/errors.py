@@ -211,7 +211,8 @@ LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 def numbers(value: object) -> ndarray | None:
     """The value as a float64 array; None if it is not a number or nested lists of numbers."""
     try:
-        array = np.asarray(value)
+        # what a mask hides is missing
+        array = value.filled(np.nan) if isinstance(value, np.ma.MaskedArray) else np.asarray(value)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # PyTorch refuses tensors with gradients so
         return None
     return array.astype(np.float64) if array.dtype.kind in "iuf" and not _holds_boolean(value) else None
