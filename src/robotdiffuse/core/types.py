@@ -416,8 +416,10 @@ class Trajectory(Value):
         path = check_output(file, (".json", ".csv"))
         if rate is not None:
             return self.resample(rate).save(path)
-        is_json = path.suffix.lower() == ".json"
-        write_atomically(path, json.dumps(self.record(), allow_nan=False) + "\n" if is_json else self._csv())
+        if path.suffix.lower() == ".json":
+            write_atomically(path, json.dumps(self.record(), allow_nan=False) + "\n")
+        else:
+            write_atomically(path, self._csv())
 
     def record(self) -> dict[str, Any]:
         """Convert the trajectory to JSON values.

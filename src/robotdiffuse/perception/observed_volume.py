@@ -527,7 +527,7 @@ def observe(views: Sequence[DepthView], robot: Robot, start: Configuration) -> O
     """
     if not len(views):
         raise InputError("views is empty; at least one depth view is needed")
-    return merged([_observed(view, robot, start) for view in views])
+    return merged([observed_by(view, robot, start) for view in views])
 
 
 def merged(volumes: Sequence[ObservedVolume]) -> ObservedVolume:
@@ -550,7 +550,7 @@ def merged(volumes: Sequence[ObservedVolume]) -> ObservedVolume:
     )
 
 
-def _observed(view: DepthView, robot: Robot, start: Configuration) -> ObservedVolume:
+def observed_by(view: DepthView, robot: Robot, start: Configuration) -> ObservedVolume:
     """The volume observed by one view."""
     q = start if view.configuration is None else view.configuration
     if len(q) != robot.dof:

@@ -24,7 +24,7 @@ from robotdiffuse.perception.observed_volume import (
     add_evidence,
     carve_view,
     merged,
-    observe,
+    observed_by,
 )
 from robotdiffuse.perception.seen_points import CELL, END_SPREADS, POINT_RADIUS, seen_points
 from robotdiffuse.perception.voxel_grid import MAP, Voxels
@@ -243,7 +243,7 @@ class _RememberedView:
 
     @cached_property
     def volume(self) -> ObservedVolume:
-        return observe([self.view], self.robot, self.configuration)
+        return observed_by(self.view, self.robot, self.configuration)
 
     @cached_property
     def points(self) -> Points:

@@ -69,7 +69,9 @@ class VoxelGrid:
         marks[marks] = marked[tuple(at[marks].T)]
         return marks
 
-    def enclose(self, marked: Voxels, points: Points, distance: Float[ndarray, "n"]) -> Bool[ndarray, "n"]:
+    def enclose(
+        self, marked: Voxels, points: Points, distance: "float | Float[ndarray, 'n']"
+    ) -> Bool[ndarray, "n"]:
         """Whether each point is in a marked voxel, with marked voxels on all six sides at a distance [m]."""
         sides = np.vstack([np.eye(4, 3), -np.eye(3)])  # the fourth is zero
         return np.all([self.hold(marked, points + np.outer(distance, side)) for side in sides], axis=0)

@@ -87,9 +87,10 @@ def plan_many(
         check_problem(problem, f"problems[{i}]")
     if workers is not None and not (isinstance(workers, Integral) and workers >= 1):
         raise InputError(f"workers is {shown(workers)}; it must be a whole number, at least 1")
-    options = [*signature(plan_many).parameters][1:-1]  # without the problems and `request`
+    names = [*signature(plan_many).parameters][1:-1]  # without the problems and `request`
+    names += [field.name for field in fields(PlanRequest)]
     for name in request:
-        check_name("argument", name, [*options, *(field.name for field in fields(PlanRequest))])
+        check_name("argument", name, names)
     load_planner(planner, settings, weights)
     if cluster is not None:
         check_name("cluster", cluster, CLUSTERS)

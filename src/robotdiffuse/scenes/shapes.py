@@ -274,6 +274,7 @@ class Cylinder(_Axial):
         name: Name in results, commands and allowed contacts.
     """
 
+    # declared again, because mypy takes inherited fields for what is stored, not for what can be given
     center: GivenVector
     wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     name: str = "cylinder"
@@ -303,6 +304,7 @@ class Capsule(_Axial):
         name: Name in results, commands and allowed contacts.
     """
 
+    # declared again, because mypy takes inherited fields for what is stored, not for what can be given
     center: GivenVector
     wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     name: str = "capsule"

@@ -1,7 +1,7 @@
 """Timing of one polyline with rounded corners: its limits, its fastest speeds, and the rows of the motion."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -176,20 +176,20 @@ def time_line(
         share = ACCELERATION_FACTOR * share
         if window == 1:
             break
-    times, q, v, a = best
     # A motion within the extra limits may exceed them slightly after the averaging.
-    slower = extra_slowdown(extra, q, v, a)
-    return times * slower, q, v / slower, a / slower**2
+    return slowed_rows(best, extra_slowdown(extra, *best[1:]))
+
+
+def slowed_rows(rows: Rows, factor: float) -> Rows:
+    """The rows of a motion with all times multiplied by a factor."""
+    times, q, v, a = rows
+    return factor * times, q, v / factor, a / factor**2
 
 
 def slowed(motion: Trajectory, factor: float) -> Trajectory:
     """The motion with all times multiplied by a factor."""
-    return replace(
-        motion,
-        times=factor * motion.times,
-        velocities=motion.velocities / factor,
-        accelerations=motion.accelerations / factor**2,
-    )
+    rows = (motion.times, motion.positions, motion.velocities, motion.accelerations)
+    return Trajectory(motion.joint_names, *slowed_rows(rows, factor))
 
 
 def within_limits(

@@ -29,6 +29,7 @@ from robotdiffuse.trajectories.speed_limits import (
     Rows,
     TimingSettings,
     TooFastError,
+    slowed_rows,
     time_line,
     within_limits,
 )
@@ -115,9 +116,8 @@ def time_parameterize(
     rows = _distinct(path.positions)
     waypoints = path.positions[rows]
     if len(rows) == 1:
-        rows = spline_rows(path.positions[[0, -1]], settings.sample_time)
-        motion = within_limits(Trajectory(path.joint_names, *rows), robot, settings)
-        return Timing(waypoints, np.zeros(0), motion)
+        motion = Trajectory(path.joint_names, *spline_rows(path.positions[[0, -1]], settings.sample_time))
+        return Timing(waypoints, np.zeros(0), within_limits(motion, robot, settings))
     allowed = np.full(len(rows), settings.corner_deviation) if deviations is None else deviations[rows]
     allowed[np.searchsorted(rows, stops, side="right") - 1] = 0.0
     deviations = _shrunk(waypoints, allowed[1:-1], keeps, MIN_DEVIATION)
@@ -318,8 +318,7 @@ class StopGraph:
         motions = []
         for factor in SPEED_FACTORS:
             ticks = max(int(np.ceil(times[-1] / factor / self.step - 1e-9)), 1)
-            slower = ticks * self.step / times[-1]
-            rows = times * slower, q, v / slower, a / slower**2
+            rows = slowed_rows((times, q, v, a), ticks * self.step / times[-1])
             back = rows[0][-1] - rows[0][::-1], q[::-1], -rows[2][::-1], rows[3][::-1]
             motions += [Motion(i, j, ticks, rows), Motion(j, i, ticks, back)]
         return motions

@@ -77,8 +77,7 @@ def stop_before(
     end = motion.positions[-1]
     seen = seen_shapes(views, robot, known, current, end[None])
     points = np.concatenate([np.zeros((0, 3)), *(shape.points for shape in seen)])
-    distances = np.full(len(points), MAP.edge)
-    appeared = PointCloud(points[MAP.enclose(free, points, distances)], APPEARED_PADDING, name="appeared")
+    appeared = PointCloud(points[MAP.enclose(free, points, MAP.edge)], APPEARED_PADDING, name="appeared")
     validator = verifier(Problem(robot, known.with_shapes([*known.shapes, *seen, appeared]), current, end))
     remaining = np.concatenate([current[None], motion.positions[motion.times > time]])
     violation = validator.path(Path(robot.joint_names, remaining)).violation

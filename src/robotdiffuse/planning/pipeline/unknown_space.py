@@ -29,7 +29,7 @@ from robotdiffuse.core.types import FIRST, Configurations, PlanResult, Status
 from robotdiffuse.perception.camera_check import camera_note
 from robotdiffuse.perception.depth_filter import measured_share
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
-from robotdiffuse.perception.observed_volume import ObservedVolume, merged, observe
+from robotdiffuse.perception.observed_volume import ObservedVolume, merged, observe, observed_by
 from robotdiffuse.perception.unknown_space import (
     MAX_UNSEEN_SHARE,
     PADDINGS,
@@ -103,10 +103,11 @@ def plan_with_unknown_space(
     else:
         predict = None
     context = PlanningContext(planner.name, problem, request)
-    views = problem.views if unknown is None else ()
-    volumes = [observe([view], problem.robot, problem.start) for view in views]
-    volume = merged(volumes)
+    volumes = list[ObservedVolume]()
+    volume = None
     if unknown is None:
+        volumes = [observed_by(view, problem.robot, problem.start) for view in problem.views]
+        volume = merged(volumes)
         predicted = predict(volume) if predict is not None else predicted
         unknown = unknown_space_of(problem, volume, predicted)
     cameras = [camera_note(view, problem.robot, problem.start) for view in problem.views]

@@ -547,6 +547,24 @@ class AddReport(NamedTuple):
         return (*warnings, *(f"spheres do not cover {link.link}" for link in self.links if not link.covered))
 
 
+def _touching_note(robot: Robot, allowed: Mapping[frozenset[str], str]) -> list[str]:
+    """A note on links that touch in all motions, and so are not checked; `allowed` pairs do not count."""
+    links = Links(robot)
+    poses = links.poses(links.named({})[None])
+    checked = robot.checked_pairs()
+    touching = [
+        f"{a} and {b}"
+        for a, b in combinations(robot.meshes, 2)
+        if (a, b) not in checked and frozenset((a, b)) not in allowed and links.collide(poses, a, b, 0)
+    ]
+    if not touching:
+        return []
+    return [
+        f"links that touch in all motions are not checked: {joined(touching)}; if joints between them are "
+        "held, --lock may hold them elsewhere"
+    ]
+
+
 def add_robot(
     urdf: str | Path,
     name: str | None = None,
@@ -625,19 +643,7 @@ def add_robot(
         settings = replace(settings, sampling=replace(settings.sampling, assumptions=False))
     prepared = prepare(robot, surfaces, settings, seed, progress, allowed)
     if not settings.sampling.assumptions:
-        links = Links(prepared.robot)
-        poses = links.poses(links.named({})[None])
-        checked = prepared.robot.checked_pairs()
-        touching = [
-            f"{a} and {b}"
-            for a, b in combinations(robot.meshes, 2)
-            if (a, b) not in checked and frozenset((a, b)) not in allowed and links.collide(poses, a, b, 0)
-        ]
-        if touching:
-            notes.append(
-                f"links that touch in all motions are not checked: {joined(touching)}; if joints between "
-                "them are held, --lock may hold them elsewhere"
-            )
+        notes += _touching_note(prepared.robot, allowed)
     measured = prepared.false_collisions
     if measured.free == 0 or measured.by_spheres == 1:  # nothing can be planned
         shares = {pair.links: max(pair.colliding, pair.by_spheres) for pair in measured.pairs}

@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -299,7 +300,7 @@ class UrdfTree:
                 digest.update(read_bytes(self.packages.file(mesh.get("filename", "")), "mesh file"))
         return digest.hexdigest()
 
-    @property
+    @cached_property
     def srdf(self) -> Path | None:
         """The SRDF that belongs to the file (see `srdf_beside`); None if there is none, and for a MuJoCo
         model."""
