@@ -6,7 +6,7 @@ import torch
 
 import robotdiffuse as rd
 from helpers.refusals import refuses
-from robotdiffuse.core.errors import InputError, counted, needs
+from robotdiffuse.core.errors import InputError, check_name, counted, needs
 
 
 def test_a_count_of_one_is_singular() -> None:
@@ -32,3 +32,8 @@ def test_masked_numbers_are_missing() -> None:
     hidden = np.ma.masked_array([0.5, 0.0, 9.0], [False, False, True])
     refuses(r"sphere.center is \[0.5, 0.0, None\]; it must be 3 finite numbers", rd.Sphere, hidden, 0.1)
     np.testing.assert_array_equal(rd.DepthView(hidden[None], (3, 3, 1, 0), np.eye(4)).depth, [[0.5, 0.0, np.nan]])
+
+
+def test_a_table_without_names_is_said_to_have_none() -> None:
+    """Regression: the message ended with "known: "."""
+    refuses("unknown body 'box'; known: none$", check_name, "body", "box", [])

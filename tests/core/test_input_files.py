@@ -277,7 +277,7 @@ def test_names_are_compared_a_few_times_each(monkeypatch: pytest.MonkeyPatch) ->
     scene = Scene([Box([1, 0, 0], [0.1, 0.1, 0.1])], [("box", [name]) for name in few])
     assert Name.compared < 5 * COUNT
     assert scene.allowed_contacts == (("box", tuple(few)),)
-    refuses(f"'box' has over {MAX_CONTACT_LINKS} links; write all", Scene, scene.shapes, [("box", names)])
+    refuses(f"'box' has over {MAX_CONTACT_LINKS} links; write 'all'", Scene, scene.shapes, [("box", names)])
 
 
 TRIANGLES = '<triangles count="1"{}><input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p></triangles>'

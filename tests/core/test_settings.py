@@ -164,4 +164,4 @@ def test_entries_of_installed_packages_are_loaded_when_they_are_used(tmp_path: P
     assert list(installed) == ["pear", "plum"]
     refuses("known: gone, pear, plum, stone", installed.entry, "apple")
     refuses("drupe gone: its entry point no_such_module:GONE cannot be loaded", installed.entry, "gone")
-    refuses("orchard:STONE is a int; it must be an Entry", installed.load_installed)
+    refuses("orchard:STONE is 1; it must be an Entry", installed.load_installed)

@@ -129,7 +129,7 @@ def test_wrong_shapes() -> None:
     refuses("an array of 1 x 2; it must be n x 3", rd.PointCloud, [[0, 0]])
     refuses(r"points\[0\] is \[0.0, 0.0, inf\]; its numbers must be finite", rd.PointCloud, [[0, 0, np.inf]])
     refuses("it must be n x 3", rd.PointCloud, [[0, 0, 0], [1]])
-    refuses(r"scene\[0\] is a str", rd.Scene, ["ball"])
+    refuses(r"scene\[0\] is 'ball'; it must be a shape", rd.Scene, ["ball"])
     refuses("scene is None; it must be a list of shapes", rd.Scene, None)
     refuses("scene is 5; it must be a list of shapes", rd.Scene, 5)
     refuses("floor is 2", VisibleRegion, floor=2.0)

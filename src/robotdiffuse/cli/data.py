@@ -92,7 +92,10 @@ def _gallery_entries(folder: Path, robot: Robot, number: int, seed: int) -> Iter
 
 def run_export(arguments: Namespace) -> None:
     count, left_out = export_npz(arguments.folder, arguments.file)
-    print(f"wrote {arguments.file}: {counted(count, 'motion')}; {left_out:,} left out, not of two spheres")
+    print(
+        f"wrote {arguments.file}: {counted(count, 'motion')}; "
+        f"{left_out:,} left out, since their scenes are not two spheres"
+    )
 
 
 def run_import(arguments: Namespace) -> None:

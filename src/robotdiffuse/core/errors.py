@@ -166,7 +166,8 @@ def repeated(names: Iterable[str]) -> list[str]:
 def unknown_name(what: str, name: object, known: Iterable[object]) -> InputError:
     """An InputError for a name that is not in a table; it lists the known names."""
     names = sorted(map(str, known))
-    return InputError(f"unknown {what} {shown(name)}; known: {joined(names)}{suggestion(name, names)}")
+    listed = joined(names) or "none"
+    return InputError(f"unknown {what} {shown(name)}; known: {listed}{suggestion(name, names)}")
 
 
 def check_name(what: str, name: object, known: Collection[object]) -> None:

@@ -13,7 +13,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, NamedTuple
 
-from robotdiffuse.core.errors import InputError, described, unknown_name
+from robotdiffuse.core.errors import InputError, described, shown, unknown_name
 
 
 @dataclass(frozen=True)
@@ -107,9 +107,8 @@ class Registry(dict[str, Entry]):
                 f"{self.what} {name}: its entry point {point.value} cannot be loaded: {described(error)}"
             ) from None
         if not isinstance(entry, Entry):
-            kind = type(entry).__name__
             raise InputError(
-                f"{self.what} {name}: its entry point {point.value} is a {kind}; it must be an Entry"
+                f"{self.what} {name}: its entry point {point.value} is {shown(entry)}; it must be an Entry"
             )
         self[name] = entry
         return entry

@@ -352,7 +352,7 @@ class Robot(KinematicTree):
             'cup'
         """
         if not hasattr(shape, "solid"):
-            raise InputError(f"attached is a {type(shape).__name__}; it must be a shape, e.g. rd.Box")
+            raise InputError(f"attached is {shown(shape)}; it must be a shape, e.g. rd.Box")
         T_link_body = shape.solid()[0]
         return self.with_body(AttachedBody(shape.name, link, T_link_body, (shape,), tuple(touch_links)))
 

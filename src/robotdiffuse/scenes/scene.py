@@ -64,9 +64,7 @@ class Scene(Value):
             raise InputError(f"scene is {shown(shapes)}; it must be a list of shapes, e.g. [rd.Sphere(...)]")
         for i, shape in enumerate(shapes):
             if not isinstance(shape, Shape):
-                raise InputError(
-                    f"scene[{i}] is a {type(shape).__name__}; it must be a shape, e.g. rd.Sphere"
-                )
+                raise InputError(f"scene[{i}] is {shown(shape)}; it must be a shape, e.g. rd.Sphere")
             name = shape.name
             number = last.get(shape.name, 1)
             while name in names_in_use:
@@ -179,7 +177,6 @@ class Scene(Value):
         obstacles = {shape.name: shape for shape in self.shapes}
         check_name("obstacle to attach:", name, obstacles)
         link = robot.tip if link is None else link
-        robot.link_frame(link)  # raises InputError, with the known links, for an unknown one
         taken_shape = obstacles.pop(name).moved(inverse(robot.fk(q, link)))
         return self.with_shapes(obstacles.values()), robot.attach(taken_shape, link, touch_links)
 
@@ -200,6 +197,7 @@ class Scene(Value):
         robot_without = robot.detach(name)
         [body] = [body for body in robot.attached if body.name == name]
         T_base_link = robot.fk(q, body.link)
+        # shapes of other classes, which a robot can hold too, cannot be obstacles
         released = [shape.moved(T_base_link) for shape in body.shapes if isinstance(shape, Shape)]
         return self.with_shapes([*self.shapes, *released]), robot_without
 
@@ -221,7 +219,7 @@ def _contacts(
         entries = allowed.items() if isinstance(allowed, Mapping) else [(a, b) for a, b in allowed]  # type: ignore
     except (TypeError, ValueError):
         raise InputError(
-            f"allowed_contacts is {shown(allowed)}; it must map obstacles to lists of links or to {ALL_LINKS}"
+            f"allowed_contacts is {shown(allowed)}; it must map obstacles to lists of links or {ALL_LINKS!r}"
         ) from None
     by_name: dict[str, dict[str | None, None]] = {}  # None stands for all links
     for obstacle, links in entries:
@@ -230,14 +228,15 @@ def _contacts(
         named = isinstance(links, list | tuple) and all(isinstance(link, str) for link in links)
         if links != ALL_LINKS and not named:
             raise InputError(
-                f"allowed_contacts: {obstacle} has {shown(links)}; it must be a list of links, or {ALL_LINKS}"
+                f"allowed_contacts: {obstacle} has {shown(links)}; "
+                f"it must be a list of links or {ALL_LINKS!r}"
             )
         for name in names_of.get(obstacle, [obstacle]):
             touching = by_name.setdefault(name, {})
             touching.update(dict.fromkeys((None,) if links == ALL_LINKS else links))
             if len(touching) > MAX_CONTACT_LINKS:
                 raise InputError(
-                    f"allowed_contacts: {shown(name)} has over {MAX_CONTACT_LINKS} links; write {ALL_LINKS}"
+                    f"allowed_contacts: {shown(name)} has over {MAX_CONTACT_LINKS} links; write {ALL_LINKS!r}"
                 )
     return tuple(
         (name, ALL_LINKS if None in touching else tuple(touching))  # type: ignore[arg-type]
@@ -295,7 +294,7 @@ def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
             case kind:
                 raise InputError(
                     f"geom {name} is of type {kind}; obstacles may be planes, spheres, capsules, ellipsoids, "
-                    f"cylinders, boxes and meshes"
+                    "cylinders, boxes and meshes"
                 )
         if surface is not None:
             shapes.append(Mesh(surface.vertices, surface.faces, center, wxyz, name=name))

@@ -34,8 +34,8 @@ PARTS = 4
 """Near goals, voxels are split into this many parts along each edge."""
 NOT_SEEN_FREE = "not seen free"
 MIN_FREE_SHARE = 0.8
-"""Before a motion to the goal is searched, at least this fraction of the space that the arm fills at the goal
-but not at the start must have been seen free: with less, searches fail (benchmarks/results/exploring.txt)."""
+"""Before a search for a motion to the goal, at least this fraction of the space that the arm fills there but
+not at the start must have been seen free: with less, searches fail (benchmarks/results/exploring.txt)."""
 WALL = 2.0
 """Thickness of the walls around the map [m]."""
 

@@ -621,7 +621,7 @@ class _Validation:
         clearance = self.context.clearance
         notes = (
             f"no path was found with a clearance of {100 * clearance:.2g} cm; "
-            f"this one was searched with {100 * search.clearance:.2g} cm",
+            f"this one was found with {100 * search.clearance:.2g} cm",
         )
         result = self.context.finish(
             path,

@@ -25,9 +25,9 @@ PACKAGE_NOT_FOUND = re.compile(r"Package not found: (\S+)")
 class Packages(NamedTuple):
     """Finds the ROS packages of a URDF.
 
-    The folder of a package is searched in `folders`, then in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, then
+    The folder of a package is looked for in `folders`, then in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, then
     from the URDF's folder upwards: first folders with the package's name, then subfolders with that name.
-    Files that the package's folder lacks are searched relative to the URDF's folder and all folders above it,
+    Files that the package's folder lacks are looked for below the URDF's folder and all folders above it,
     with and without the package's name.
     """
 
