@@ -450,7 +450,7 @@ def test_a_timed_path_is_as_fast_as_its_timing() -> None:
     robot = rd.load_robot("panda")
     line = rounded_line(np.array([np.zeros(7), np.full(7, 0.8), np.linspace(0, 1, 7)]), np.array([0.1]))
     fastest = speed_limits.time_line(robot, line, TimingSettings())[0][-1]
-    found = TimedPath(robot, 0.96 * robot.acceleration, line, True).on_then_rest(0.0, 0.0).duration
+    found = TimedPath(robot, 0.96 * robot.acceleration, line, True).advance_then_brake(0.0, 0.0).duration
     assert found == pytest.approx(fastest, rel=0.05)
 
 

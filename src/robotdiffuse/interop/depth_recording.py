@@ -220,7 +220,7 @@ def _read(
         yield StampedView(stamp, DepthView(_depth(location, message, unit), intrinsics, T, q))
     if not has_views:
         listed = ", ".join(f"{topic} ({kind})" for topic, kind in kinds.items()) or "none"
-        raise reason or InputError(f"{path} holds no depth images (32FC1 or 16UC1); topics: {listed}")
+        raise reason or InputError(f"{path} holds no depth images ({', '.join(ENCODINGS)}); topics: {listed}")
 
 
 def _image_topics(kinds: Mapping[str, str], requested: Sequence[str] | None) -> list[str]:
@@ -269,15 +269,16 @@ def _depth(where: str, image: Any, unit: float | None) -> Float[ndarray, "h w"]:
     rows = np.asarray(image.data, np.uint8).reshape(image.height, image.step)
     size = np.dtype(kind).itemsize * image.width
     pixels = np.ascontiguousarray(rows[:, :size]).view((">" if image.is_bigendian else "<") + kind)
-    if unit is not None and kind == "u2":
-        scale = unit
-    return scale * np.where(kind == "u2" and (pixels == INTEGER_NO_RETURN), 0, pixels).astype(np.float32)
+    if kind == "u2":
+        scale = scale if unit is None else unit
+        pixels = np.where(pixels == INTEGER_NO_RETURN, 0, pixels)
+    return scale * pixels.astype(np.float32)
 
 
 def around(history: list[tuple[float, Any]], stamp: float) -> tuple[Any, Any, float] | None:
-    """The entries before and after a time in a history sorted by time, and the fraction of the interval
-    between them that has passed at the time. If only one entry is within MAX_GAP of the time, it is returned
-    twice; None if there is none."""
+    """The entries before and after a time, in a history sorted by time, and where the time is between them:
+    0 at the first, 1 at the second. An entry at the time itself, or the only one within MAX_GAP of the time,
+    is returned twice; None if there is none."""
     i = bisect_left(history, stamp, key=itemgetter(0))
     near = [row for row in history[max(i - 1, 0) : i + 1] if abs(row[0] - stamp) <= MAX_GAP]
     if not near:

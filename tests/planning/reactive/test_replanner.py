@@ -205,17 +205,17 @@ def test_limits_hold_at_every_time_however_often_the_arm_brakes(seed: int) -> No
     filtered = JerkFilter(PANDA, jerk, step, waypoints[0])
     path = TimedPath(PANDA, filtered.acceleration, rounded_line(waypoints, np.full(3, 0.1)), True)
     given = SpeedProfile(np.zeros(2), np.zeros(2))
-    dense = path.positions(path.on_then_rest(0.0, 0.0), np.arange(0.0, 20.0, 0.002))
+    dense = path.positions(path.advance_then_brake(0.0, 0.0), np.arange(0.0, 20.0, 0.002))
     reach = motion_radii(PANDA).max(axis=0)
     since = 0.0
     last = None
     for k in range(400):
         now = k * period
         filtered.advance(path, given, since, now)
-        given = given.rest(now - since)
+        given = given.after(now - since)
         since = now
         if k % 11 < 8 and given.s[0] < path.end:  # else the arm brakes for a while
-            given = path.on_then_rest(float(given.s[0]), float(given.speeds[0]), period)
+            given = path.advance_then_brake(float(given.s[0]), float(given.speeds[0]), period)
         motion = filtered.follow(path, given)
         states = motion.at(np.arange(0.0, motion.duration, 1e-4))
         assert (np.abs(states.velocities) <= PANDA.velocity).all()

@@ -100,8 +100,8 @@ def make_clearance_workspace(robot, solids):
 @allocation_free(forceinline=True)
 def to_solid(points, velocities, solid):
     """Signed distances of the points in 16 lanes to a row of `SceneArrays.solids`, and the components of the
-    points' velocities along the lines to the solid's nearest points, as absolute values; 0 inside its box or
-    disc."""
+    points' velocities along the lines to the solid's nearest points, as absolute values. The components are 0
+    inside the box or cylinder that the solid's ball rounds."""
     u, v, w = in_axes(solid, minus(points, solid))
     # velocity in the solid's axes; multiplied by the sign of the coordinate, it is the speed away from the
     # center
@@ -110,7 +110,8 @@ def to_solid(points, velocities, solid):
     if solid[16] > _ZERO:
         from_axis = sqrt(u * u + v * v)
         p = (u * p + v * q) / maximum(from_axis, _TINY)
-        u, v = from_axis - solid[12], u * _ZERO - solid[12]
+        u = from_axis - solid[12]
+        v = minimum(u, _ZERO)  # u alone counts
     else:
         p = p * copysign(_ONE, u)
         q = q * copysign(_ONE, v)

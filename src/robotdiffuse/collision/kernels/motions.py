@@ -15,8 +15,8 @@ RELAXATION_SLOPE = np.float32(0.1)
 """If a start or goal is closer to the scene than the padding, the padding is reduced at this configuration
 and grows by this much per radian of distance from it [m/rad]."""
 RELAXATION_STEP = np.float32(0.1)
-"""Near such a start or goal, a motion is divided into parts of at most this length, each with a constant
-padding [rad]."""
+"""If there is such a start or goal, motions are divided into parts of at most this length [rad], each with a
+constant padding."""
 
 
 class Space(NamedTuple):
@@ -92,7 +92,7 @@ def motion_free(space, a, b, scratch):
     first = 0
     first_padding = padding_near(space, a, b, np.float32(0.5) / np.float32(steps), half)
     for k in range(1, steps + 1):
-        padding = np.float32(-1.0)
+        padding = np.float32(-1.0)  # unlike any other: ends the last stretch
         if k < steps:
             padding = padding_near(space, a, b, (np.float32(k) + np.float32(0.5)) / np.float32(steps), half)
         if padding != first_padding:
@@ -138,8 +138,8 @@ def _stretch_free(space, a, b, s, t, padding, scratch):
         # the lanes of each block are spread evenly over the motion
         shares = (lane_numbers() * np.float32(blocks) + np.float32(blocks - k)) * step
         for j in range(dof):
-            far = np.float32(b[j] - a[j])
-            store(scratch.block, j, 0, shares * far + (np.float32(a[j]) + s * far))
+            change = np.float32(b[j] - a[j])
+            store(scratch.block, j, 0, shares * change + (np.float32(a[j]) + s * change))
         if block_hits(space.robot, space.scene, scratch.block, padding, True, scratch.work):
             return False
     return True
@@ -148,8 +148,7 @@ def _stretch_free(space, a, b, s, t, padding, scratch):
 @kernel(nogil=True)
 def motions_free(space, path):
     """For each row of path[n, dof] but the last, whether the straight motion to the next row is free of
-    collision: bool[n - 1]. Row 0 itself is not checked.
-    """
+    collision: bool[n - 1]. Row 0 itself is not checked."""
     scratch = make_scratch(space, space.lower)
     out = np.empty(len(path) - 1, np.bool_)
     for i in range(len(path) - 1):

@@ -30,7 +30,7 @@ ROW_TIME = 0.004
 """Largest time between the rows while a stop brakes [s]."""
 LEAST_STEP = 1e-3
 """Smallest time between the rows of a stop [s]; a stop takes at least this long."""
-BRAKING_DELAY = 0.02
+DELAY_STEP = 0.02
 """Step between the times at which braking may begin [s]."""
 BRAKING_TIMES = 0.05 * 1.12 ** np.arange(35)
 """Durations of braking that are tried, the shortest first [s]."""
@@ -94,7 +94,7 @@ def braked(robot: Robot, motion: Trajectory, time: float) -> Trajectory:
     seconds uses up b / 2 of the motion's time."""
     used = motion.duration - time
     best = _rows(motion, time, max(used, LEAST_STEP), 0.0, RAMPS[0])
-    for delay in np.arange(0.0, used, BRAKING_DELAY):
+    for delay in np.arange(0.0, used, DELAY_STEP):
         for braking, ramp in product(BRAKING_TIMES, RAMPS):
             if delay + braking / 2 >= used:
                 break
@@ -112,7 +112,7 @@ def _rows(motion: Trajectory, time: float, delay: float, braking: float, ramp: f
     While braking, the motion's time passes with a speed that falls from 1 to 0. The deceleration of this
     speed is a trapezoid: it rises for `ramp` of the braking time, is constant, and falls for `ramp`.
     """
-    # rows between those of the motion would miss its accelerations
+    # rows at other times than the motion's would change its accelerations
     after = motion.times - time
     unchanged = after[(after > LEAST_STEP) & (after < delay - LEAST_STEP)]
     slowed = np.linspace(delay, delay + braking, int(braking / ROW_TIME) + 2)
@@ -128,8 +128,8 @@ def _rows(motion: Trajectory, time: float, delay: float, braking: float, ramp: f
 
 @lru_cache
 def _braking(ramp: float) -> tuple[BSpline, BSpline, BSpline]:
-    """The acceleration of the motion's time (negative) as a function of the fraction of the braking time that
-    has passed, its integral and its second integral."""
+    """Functions of the fraction of the braking time that has passed: the derivative of the speed at which the
+    motion's time passes, the change of this speed, and the integral of this change. All are negative."""
     peak = 1 / (1 - ramp)
     slowing = BSpline([0, 0, ramp, 1 - ramp, 1, 1], np.array([0, -peak, -peak, 0]), 1)
     loss = slowing.antiderivative()

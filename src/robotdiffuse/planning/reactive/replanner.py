@@ -323,7 +323,7 @@ class Replanner:
         begins = self._now + self.settings.period
         self._filter.advance(self._path, self._motion, self._since, begins)
         if np.isfinite(self._since):
-            self._motion = self._motion.rest(begins - self._since)
+            self._motion = self._motion.after(begins - self._since)
         self._since = begins
         oldest = min(observed.time for observed in self._seen.values())
         predicted = self._predict()
@@ -419,7 +419,7 @@ class Replanner:
         begins the path when it rests."""
         s, speed = (self._motion.s[0], self._motion.speeds[0]) if under_way else (0.0, 0.0)
         begins = self._since if under_way else self._rest_time
-        motion = path.on_then_rest(s, speed)
+        motion = path.advance_then_brake(s, speed)
         times = COARSE_SAMPLE_TIME * np.arange(int(np.ceil(motion.duration / COARSE_SAMPLE_TIME)) + 2)
         soon = times[: max(int(np.searchsorted(times, HORIZON)), 1)]
         rest_time = REST_TIME if len(soon) == len(times) else 0.0
@@ -502,7 +502,7 @@ class Replanner:
         if s >= path.end or self._must_leave:
             return False
         for periods in DRIVING_PERIODS:
-            extended = path.on_then_rest(s, speed, periods * settings.period)
+            extended = path.advance_then_brake(s, speed, periods * settings.period)
             motion = self._filter.follow(path, extended)
             end_time = self._since + motion.duration
             left_alone = clear or predicted.comes(motion.positions[-1], end_time, REST_TIME) is None

@@ -3,7 +3,7 @@ profiles along them, and a filter for jerk limits.
 
 The filter takes a motion within velocity and acceleration limits. It samples the motion on a grid of times,
 averages the samples over a window, and uses the means as control points of a uniform cubic B-spline. The
-spline at any time depends only on samples up to that time, so replanning does not change the spline before.
+spline at any time depends only on samples up to that time, so replanning does not change what lies before.
 Its velocities and accelerations are weighted means of the motion's. Its jerk is at most twice the
 acceleration limit divided by the duration of the window.
 """
@@ -52,8 +52,8 @@ class SpeedProfile(NamedTuple):
     s: Values
     speeds: Values
 
-    def rest(self, time: float) -> "SpeedProfile":
-        """The remaining motion from a time [s] after its beginning on."""
+    def after(self, time: float) -> "SpeedProfile":
+        """What remains of the motion at a time [s] after its beginning."""
         s, speed = states_at(self.s, self.speeds, np.array([time]))
         later = self.s > s + 1e-12
         return SpeedProfile(np.append(s, self.s[later]), np.append(speed, self.speeds[later]))
@@ -92,14 +92,15 @@ class TimedPath:
         if path.length < MIN_LENGTH or not validator.collision_free(path):
             return None
 
+        contact = max(jerk_filter.displacement, DEFAULT.contact)
+        with_clearance = verifier(validator.problem, replace(DEFAULT, contact=contact))
+
         def free(motion: Trajectory) -> bool:
             return validator.collision_free(Path(motion.joint_names, motion.positions))
 
         def free_around(q: Configurations) -> bool:
-            return distant.collision_free(Path(robot.joint_names, q))
+            return with_clearance.collision_free(Path(robot.joint_names, q))
 
-        contact = max(jerk_filter.displacement, DEFAULT.contact)
-        distant = verifier(validator.problem, replace(DEFAULT, contact=contact))
         rows, deviations, _ = time_parameterize(
             robot, path, free, validator.collision_free, keeps=free_around
         )
@@ -124,9 +125,9 @@ class TimedPath:
         bounds = symmetric_bounds(self.acceleration, len(grid))
         return *path, controllable(*path, VELOCITY_FRACTION * self.robot.velocity, *bounds)
 
-    def on_then_rest(self, s: float, speed: float, time: float = np.inf) -> SpeedProfile:
+    def advance_then_brake(self, s: float, speed: float, time: float = np.inf) -> SpeedProfile:
         """The motion from s, with the speed ṡ, that is as fast as possible for `time` [s], then brakes to
-        rest, at the latest at the end."""
+        rest, at the latest at the end of the path."""
         return SpeedProfile(
             *braking_kernel.advance_then_brake(*self._grid, s, speed, time, self.acceleration)
         )
@@ -160,8 +161,8 @@ GRID_TOLERANCE = 1e-4
 STILL = 1e-9
 """The arm rests if its last samples differ by less than this in each joint [rad]."""
 B_SPLINE = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
-"""Coefficients of the uniform cubic B-spline: a row for each power of the place, a column for each control
-point."""
+"""Coefficients of the uniform cubic B-spline: a row for each power of u, the fraction of a step that has
+passed, and a column for each control point."""
 
 
 class JerkFilter:
@@ -226,7 +227,7 @@ class JerkFilter:
         already."""
         step = self.step
         window = self._window
-        u = self._ago / self.step
+        u = self._ago / step
         resting = self.at_rest and motion.duration == 0
         count = 1 if resting else int(np.ceil((motion.duration + self._ago) / step)) + window + 2
         times = step * np.arange(1, count + 1) - self._ago
