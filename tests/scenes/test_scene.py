@@ -9,6 +9,7 @@ import trimesh
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
+from helpers.commands import python
 from helpers.refusals import refuses
 from robotdiffuse.collision.checker import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
@@ -22,6 +23,13 @@ WALL = rd.Box([0.9, 0.6, 0.0], [0.05, 0.4, 0.4], name="wall")
 FINGERS = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
 HOME = np.array([0.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 AWAY = np.array([1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
+
+
+class SolidOnly:
+    """An object that a robot can hold, but that is no shape of a scene."""
+
+    name = "lump"
+    solid = BALL.solid
 
 
 def grasp(kind: str, contacts: dict[str, object]) -> rd.Problem:
@@ -107,6 +115,45 @@ def test_unknown_names_are_errors_with_the_known_ones() -> None:
         rd.Problem(box_arm(), rd.Scene([BALL], {"ball": ["l9"]}), [0, 0, 1.0], [0, 0, -1.0])
     for wrong in ([["ball"]], "ball", 3, {"ball": "l3"}, {"ball": 3}, {"ball": [3]}, {3: "all"}):
         refuses("allowed_contacts", rd.Scene, [BALL], wrong)
+
+
+WRONG_TYPES = """
+import numpy as np
+import robotdiffuse as rd
+
+ball, box, cloud = rd.Sphere([1, 0, 0], 0.1, "ball"), rd.Box([1, 0, 0], [1, 1, 1]), rd.PointCloud([[1, 0, 0]])
+robot, scene, moving = rd.load_robot("panda"), rd.Scene([ball]), rd.MovingObstacle(ball, velocity=[1, 0, 0])
+space = rd.Workspace(robot)
+space.add(ball)
+two = np.array(["panda_hand", "panda_link7"])
+calls = [(rd.Scene, [ball], {"ball": two}), (space.allow, "ball", two), (robot.with_tool, "panda_hand", np.eye(4), (), (), two)]
+for name in (two, ["panda_hand"], {}, ""):
+    calls += [(robot.attach, box, name), (scene.attach, "ball", robot, np.zeros(7), name), (space.pose, "ready", name)]
+    calls += [(robot.fk, np.zeros(7), name), (robot.jacobian, np.zeros(7), name), (rd.Workspace, robot, name)]
+for T in (np.eye(3), 2 * np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0]), "T"):
+    calls += [(thing.moved, T) for thing in (ball, box, cloud, scene, moving)] + [(robot.with_tool, "panda_hand", T)]
+for call, *arguments in calls:
+    try:
+        call(*arguments)
+    except rd.InputError as error:
+        assert len(str(error).splitlines()) == 1
+    else:
+        raise AssertionError((call, arguments))
+for thing in (ball, box, cloud, scene, moving):
+    thing.moved(np.eye(4).tolist())
+"""
+
+
+def test_wrong_names_and_motions_are_refused_in_one_line() -> None:
+    """Regression: lists and arrays in place of names were a TypeError or a ValueError; a box moved by twice the identity stayed
+    as it was. A process without this suite's type checks makes these calls."""
+    python(WRONG_TYPES)
+
+
+def test_what_a_scene_cannot_hold_is_not_lost() -> None:
+    """Regression: a held object that is no shape of a scene was in neither scene nor robot after `Scene.detach`."""
+    held = box_arm().attach(SolidOnly(), "l3")
+    refuses(r"scene\[1\] is a SolidOnly; it must be a shape", rd.Scene([WALL]).detach, "lump", held, np.zeros(3))
 
 
 def test_a_name_given_twice_stands_for_both() -> None:

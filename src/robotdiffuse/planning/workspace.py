@@ -387,9 +387,7 @@ class Workspace:
             InputError: For an unknown obstacle, and for links that are not a list of names or "all".
         """
         contacts = dict(self.scene.allowed_contacts) | {self._obstacle(obstacle).name: links}
-        self.scene = Scene(
-            self.scene.shapes, {name: allowed for name, allowed in contacts.items() if allowed}
-        )
+        self.scene = Scene(self.scene.shapes, contacts)
 
     def attach(
         self, name: str, q: AnyConfiguration, link: str | None = None, touch_links: Iterable[str] = ()
@@ -438,7 +436,7 @@ class Workspace:
         Raises:
             InputError: For an unknown link or name, and q of the wrong length or out of limits.
         """
-        return self.T_world_base @ self.robot.fk(self._configuration(q), link or self.tip)
+        return self.T_world_base @ self.robot.fk(self._configuration(q), self.tip if link is None else link)
 
     def ik(self, pose: ArrayLike, near: ArrayLike | None = None, count: int = 10) -> ndarray:
         """Inverse kinematics: configurations that bring the tip to a pose. Collisions are not checked.

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, unknown_name
 from robotdiffuse.core.loading import loading
 from robotdiffuse.core.transforms import inverse, moved_spheres, rotation_about, rotation_z_to, transform
 from robotdiffuse.core.types import (
@@ -415,7 +415,7 @@ class KinematicTree(Value):
     def check_moved(self, field: str, link: str) -> None:
         """Raises InputError, with `field` in its message, unless a planned joint moves the link."""
         moved = [name for name in self.link_names if self.link_frame(name) > 0]
-        if link not in self.link_names:
+        if not isinstance(link, str) or link not in self.link_names:
             raise unknown_name(f"link in {field}:", link, moved)
         if link not in moved:
             raise InputError(f"{field}: no planned joint moves {link!r}; moved links: {', '.join(moved)}")
@@ -429,8 +429,7 @@ class KinematicTree(Value):
         return [values[name] for name in self.joint_names]
 
     def _link(self, link: str) -> tuple[int, ndarray]:
-        if link not in self._frames[0]:
-            raise unknown_name("link", link, self.link_names)
+        check_name("link", link, self._frames[0])
         return self._frames[0][link]
 
 

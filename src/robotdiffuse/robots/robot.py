@@ -20,6 +20,7 @@ from robotdiffuse.core.errors import (
     check_name,
     counted,
     numbers,
+    rigid_transform,
     shown,
     unknown_name,
     within,
@@ -190,7 +191,7 @@ class Robot(KinematicTree):
             [0.31, 0.0, 0.59]
         """
         rows = configurations(self, q)
-        name = link or self.tip
+        name = self.tip if link is None else link
         T = self.frames_at(np.atleast_2d(rows))[self.link_frame(name)] @ self.T_frame_link(name)
         return T[0] if rows.ndim == 1 else T
 
@@ -211,7 +212,7 @@ class Robot(KinematicTree):
             InputError: For an unknown link, or q of the wrong shape.
         """
         rows = configurations(self, q)
-        name = link or self.tip
+        name = self.tip if link is None else link
         frames = self.frames_at(np.atleast_2d(rows))
         origins = (frames[self.link_frame(name)] @ self.T_frame_link(name))[:, :3, 3]
         chain = list(self.chain(name))
@@ -379,12 +380,13 @@ class Robot(KinematicTree):
             The robot with the tool.
 
         Raises:
-            InputError: In the cases in which `attach` raises it, and if the robot already has a tool.
+            InputError: In the cases in which `attach` raises it, for a pose that is not rigid, and if the
+                robot already has a tool.
         """
         tools = [body.name for body in self.attached if body.tool]
         if tools:
             raise InputError(f"tool: the robot has the tool {tools[0]!r} already; detach it first")
-        T = np.asarray(T_link_tool, np.float64)
+        T = rigid_transform("tool.T_link_tool", T_link_tool)
         return self.with_body(AttachedBody(name, link, T, tuple(shapes), tuple(touch_links), tool=True))
 
     def with_body(self, body: AttachedBody) -> "Robot":
@@ -402,9 +404,10 @@ class Robot(KinematicTree):
         """
         field = TOOL if body.tool else "attached"
         self.check_moved(f"{field}.link", body.link)
-        if body.name in self.link_names:
+        if not isinstance(body.name, str) or body.name in self.link_names:
             raise InputError(
-                f"{field}.name is {body.name!r}, a link or held object of {self.name}; give it another name"
+                f"{field}.name is {shown(body.name)}; it must be a name that no link or held object of "
+                f"{self.name} has"
             )
         for link in body.touch_links:
             check_name(f"link in {field}.touch_links:", link, self.link_names)

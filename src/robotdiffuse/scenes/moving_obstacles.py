@@ -57,13 +57,14 @@ POSE_TOLERANCE = 1e-6
 @no_type_check
 @frozen_dataclass
 class MovingObstacle(Value):
-    """A shape with its pose at time 0, in the frame of the robot's base, and one of three motions.
+    """A shape in the frame of the robot's base, and one of three motions.
 
     Args:
-        shape: The shape at time 0; not a point cloud, which has no frame of its own.
+        shape: The shape at time 0, or at the first of the times; not a point cloud, which has no frame of its
+            own.
         velocity: The shape keeps its orientation and moves at this constant velocity forever [m/s].
         times: Times of the poses [n], increasing [s].
-        poses: T_base_shape at each time [n, 4, 4], at first the pose of the shape. Between the times, the
+        poses: T_base_shape at each time [n, 4, 4]; the first is the pose of the shape. Between the times, the
             shape moves on straight lines at constant speed and turns at a constant rate. Before the first and
             after the last time it stands still.
         max_speed: The motion is unknown, but no point of the shape is faster than this [m/s].
@@ -199,9 +200,9 @@ class MovingObstacle(Value):
             The pose [4, 4]; if the motion is unknown, the pose at time 0.
         """
         times, poses = self.track
-        i = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, max(len(times) - 2, 0)))
         if len(times) == 1:
             return poses[0]
+        i = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 2))
         fraction = float(np.clip((time - times[i]) / (times[i + 1] - times[i]), 0.0, 1.0))
         xyz = poses[i, :3, 3] + fraction * (poses[i + 1, :3, 3] - poses[i, :3, 3])
         if np.array_equal(poses[i, :3, :3], poses[i + 1, :3, :3]):
@@ -228,7 +229,11 @@ class MovingObstacle(Value):
 
         Returns:
             The obstacle after the rigid motion.
+
+        Raises:
+            InputError: Unless T is rigid.
         """
+        T = rigid_transform("T", T)
         velocity = None if self.velocity is None else T[:3, :3] @ self.velocity
         poses = None if self.poses is None else T @ self.poses
         return replace(self, shape=self.shape.moved(T), velocity=velocity, poses=poses)

@@ -21,7 +21,7 @@ MAX_CONTACT_LINKS = 1000
 """Largest number of links that `Scene.allowed_contacts` may name for one obstacle."""
 
 PLANE_SIZE = 10.0
-"""Edge of the box that stands for an infinite plane [m]."""
+"""Smallest edge of the box that stands for a plane [m]."""
 PLANE_DEPTH = 0.1
 """Thickness of the boxes that stand for planes [m]."""
 
@@ -93,8 +93,8 @@ class Scene(Value):
                 reads from a model has the base "world".
 
         Returns:
-            The scene. Planes become boxes of their size; an infinite plane becomes a box of 10 m. Meshes are
-            replaced by their convex hulls, as MuJoCo does.
+            The scene. A plane, which is infinite in MuJoCo whatever its size, becomes a box with edges of at
+            least 10 m. Meshes are replaced by their convex hulls, as MuJoCo does.
 
         Raises:
             InputError: For an unknown body, and for soft bodies, height fields and signed distance fields.
@@ -111,7 +111,7 @@ class Scene(Value):
             The scene after the motion.
 
         Raises:
-            InputError: For shapes that cannot be moved.
+            InputError: For shapes that cannot be moved, and unless T is rigid.
         """
         return self.with_shapes([shape.moved(T) for shape in self.shapes])
 
@@ -192,14 +192,14 @@ class Scene(Value):
             The scene with the object, and the robot without the object.
 
         Raises:
-            InputError: For an unknown name, and for an object to which a body is attached.
+            InputError: For an unknown name, an object to which a body is attached, and one that is no shape.
         """
         robot_without = robot.detach(name)
         [body] = [body for body in robot.attached if body.name == name]
         T_base_link = robot.fk(q, body.link)
-        # shapes of other classes, which a robot can hold too, cannot be obstacles
-        released = [shape.moved(T_base_link) for shape in body.shapes if isinstance(shape, Shape)]
-        return self.with_shapes([*self.shapes, *released]), robot_without
+        # with_shapes refuses objects of other classes, which a robot can hold too
+        released = [shape.moved(T_base_link) if isinstance(shape, Shape) else shape for shape in body.shapes]
+        return self.with_shapes([*self.shapes, *released]), robot_without  # type: ignore[list-item]
 
 
 def contact_notes(scene: Scene) -> tuple[str, ...]:
@@ -221,19 +221,20 @@ def _contacts(
         raise InputError(
             f"allowed_contacts is {shown(allowed)}; it must map obstacles to lists of links or {ALL_LINKS!r}"
         ) from None
-    by_name: dict[str, dict[str | None, None]] = {}  # None stands for all links
+    by_name: dict[str, dict[str | None, None]] = {}  # dictionaries as ordered sets; None: all links
     for obstacle, links in entries:
         if not isinstance(obstacle, str) or (obstacle not in names_of and obstacle not in names):
             raise unknown_name("obstacle in allowed_contacts:", obstacle, names)
-        named = isinstance(links, list | tuple) and all(isinstance(link, str) for link in links)
-        if links != ALL_LINKS and not named:
+        every = isinstance(links, str) and links == ALL_LINKS
+        listed = isinstance(links, list | tuple) and all(isinstance(link, str) for link in links)
+        if not every and not listed:
             raise InputError(
                 f"allowed_contacts: {obstacle} has {shown(links)}; "
                 f"it must be a list of links or {ALL_LINKS!r}"
             )
         for name in names_of.get(obstacle, [obstacle]):
             touching = by_name.setdefault(name, {})
-            touching.update(dict.fromkeys((None,) if links == ALL_LINKS else links))
+            touching.update(dict.fromkeys([None] if every else links))
             if len(touching) > MAX_CONTACT_LINKS:
                 raise InputError(
                     f"allowed_contacts: {shown(name)} has over {MAX_CONTACT_LINKS} links; write {ALL_LINKS!r}"
@@ -277,9 +278,9 @@ def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
         surface = None
         match mjcf.kind_of("Geom", model.geom_type[geom]):
             case "plane":
-                halves = np.where(size[:2] > 0, size[:2], PLANE_SIZE / 2)
+                edges = np.maximum(2 * size[:2], PLANE_SIZE)
                 below = center - T[:3, 2] * PLANE_DEPTH / 2
-                shapes.append(Box(below, [*2 * halves, PLANE_DEPTH], wxyz, name))
+                shapes.append(Box(below, [*edges, PLANE_DEPTH], wxyz, name))
             case "sphere":
                 shapes.append(Sphere(center, float(size[0]), name))
             case "box":

@@ -25,6 +25,7 @@ from robotdiffuse.core.errors import (
     numbers,
     points,
     positive,
+    rigid_transform,
     shown,
     unit_quaternion,
     vector,
@@ -86,7 +87,7 @@ class Shape(Value, ABC):
             The shape after the motion. For a point cloud, `file` is None.
 
         Raises:
-            InputError: For kinds of shapes that do not support motions.
+            InputError: For kinds of shapes that do not support motions, and unless T is rigid.
         """
         raise InputError(f"a {self.kind} cannot be moved; write it as a mesh")
 
@@ -197,7 +198,11 @@ class Sphere(Shape):
 
         Returns:
             The sphere after the motion.
+
+        Raises:
+            InputError: Unless T is rigid.
         """
+        T = rigid_transform("T", T)
         return replace(self, center=T[:3, :3] @ self.center + T[:3, 3])
 
 
@@ -217,7 +222,7 @@ class _Posed(Shape):
         return transform(getattr(self, self.origin), self.rotation)
 
     def moved(self, T: Pose) -> "Shape":
-        T = T @ self.T_base_shape
+        T = rigid_transform("T", T) @ self.T_base_shape
         moved: dict[str, Any] = {self.origin: T[:3, 3], "wxyz": quaternion_from_rotation(T[:3, :3])}
         return replace(self, **moved)  # type: ignore[type-var]
 
@@ -401,8 +406,11 @@ class PointCloud(Shape):
 
         Returns:
             The cloud after the motion, without its `file`.
+
+        Raises:
+            InputError: Unless T is rigid.
         """
-        return replace(self, points=placed(T, self.points), file=None)
+        return replace(self, points=placed(rigid_transform("T", T), self.points), file=None)
 
 
 class Triangulated(Shape):

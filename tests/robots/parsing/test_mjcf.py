@@ -138,6 +138,16 @@ def test_a_scene_is_all_that_is_not_the_robot(file: Path) -> None:
     refuses("body", rd.Scene.from_mujoco, model, base="bse")
 
 
+def test_a_plane_is_never_smaller_than_where_mujoco_collides() -> None:
+    """Regression: a floor with a size became a box of this size, which MuJoCo only draws."""
+    world = '<geom type="plane" size="0.1 7 1"/><body pos="3 0 0.05"><freejoint/><geom size="0.1"/></body>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{world}</worldbody></mujoco>")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert data.ncon == 1
+    np.testing.assert_allclose(rd.Scene.from_mujoco(model).shapes[0].bounds, [[-5, -7, -0.1], [5, 7, 0]])
+
+
 FIELD = '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>'
 CLOTH = """<flexcomp name="cloth" type="grid" count="3 3 1" spacing="1 1 1" radius="0.1" dim="2">
   {}</flexcomp>"""
