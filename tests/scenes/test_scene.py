@@ -153,7 +153,7 @@ def test_wrong_names_and_motions_are_refused_in_one_line() -> None:
 def test_what_a_scene_cannot_hold_is_not_lost() -> None:
     """Regression: a held object that is no shape of a scene was in neither scene nor robot after `Scene.detach`."""
     held = box_arm().attach(SolidOnly(), "l3")
-    refuses(r"scene\[1\] is a SolidOnly; it must be a shape", rd.Scene([WALL]).detach, "lump", held, np.zeros(3))
+    refuses(r"scene\[1\] is .*SolidOnly.*; it must be a shape", rd.Scene([WALL]).detach, "lump", held, np.zeros(3))
 
 
 def test_a_name_given_twice_stands_for_both() -> None:

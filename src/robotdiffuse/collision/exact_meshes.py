@@ -231,8 +231,9 @@ class ExactCollision:
         hits = coal.CollisionResult()
         coal.collide(piece.geometry, T_piece, other.geometry, other.T, request, hits)
         if hits.isCollision():
-            depths = [hits.getContact(i).penetration_depth for i in range(hits.numContacts())]
-            return min([0.0, *depths]) - other.inflation
+            contacts = map(hits.getContact, range(hits.numContacts()))
+            # Coal's penetration depths are negative
+            return min([0.0, *(contact.penetration_depth for contact in contacts)]) - other.inflation
         if np.isfinite(cutoff):
             result.min_distance = cutoff + other.inflation
         distance = coal.distance(piece.geometry, T_piece, other.geometry, other.T, self._request, result)
@@ -255,7 +256,7 @@ class ExactCollision:
         frames = forward_frames(self.robot, q)
         distances = np.full(len(q), np.nan)
         names: list[str | None] = [None] * len(q)
-        depth = stop == -np.inf
+        depth = stop == -np.inf  # of a distance at which the search stops, only the sign matters
         for i, (check, cutoff) in enumerate(zip(checks.tolist(), cutoffs.tolist(), strict=True)):
             candidates = self._candidates[check]
             obstacle = None
@@ -299,7 +300,7 @@ class ExactCollision:
         the penetration may be too small, but the sign is right.
         """
         assert candidates.surfaces is not None
-        best, _ = self._closest(candidates, frames, cutoff, -np.inf if depth else -MAX_OVERLAP, depth=True)
+        best, _ = self._closest(candidates, frames, cutoff, -np.inf if depth else -MAX_OVERLAP, depth)
         if not -MAX_OVERLAP < best < SURFACES_BELOW:
             return best
         surface_distance = candidates.surfaces.distance(frames, cutoff)
@@ -319,11 +320,10 @@ class ExactCollision:
         """Signed distance of a link to the nearest obstacle [m] after the whole robot, base included, is
         moved by T. This equals the distance to obstacles that are moved by the inverse of T."""
         frames = T @ forward_frames(self.robot, q[None])[0]
-        obstacles = self._obstacles
         return min(
-            self._signed(piece, obstacle, frames, np.inf, True)
+            self._signed(piece, obstacle, frames, np.inf, depth=True)
             for piece in self._pieces[link]
-            for obstacle in obstacles
+            for obstacle in self._obstacles
         )
 
     def _all(self, q: ndarray, checks: range) -> tuple[Distance, ...]:
@@ -371,7 +371,7 @@ class ExactCollision:
 @once_per_robot
 def warm_up(robot: Robot) -> None:
     """Load Coal and build the robot's Coal objects now, so that later calls do not spend their time limit on
-    it."""
+    this."""
     explain_collision(robot, Scene([Sphere([0.0, 0.0, 100.0], 1.0)]), (robot.lower + robot.upper) / 2)
 
 

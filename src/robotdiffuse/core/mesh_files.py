@@ -181,10 +181,10 @@ def _size(
             if url not in known:
                 known[url] = None
                 known[url] = _size(nodes[url], nodes, sizes, known, depth + 1)
-            weight = known[url]
-            if weight is None:
+            size = known[url]
+            if size is None:
                 raise InputError(f"its node {shown(url)} contains itself")
-            total += weight
+            total += size
     return total
 
 

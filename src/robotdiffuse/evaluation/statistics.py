@@ -121,18 +121,18 @@ def normalized(rows: Sequence[Indicators]) -> Float[ndarray, "n 4"]:
     """The paper's V_norm of every row and indicator: 1 for the best row, 0 for the worst, linear in between.
 
     If an indicator is equal in all rows, the paper's formula gives 0 / 0; here all rows get 1, since each is
-    as good as the best. An unknown indicator (NaN, such as the length if no problem was solved) gets 0, as
+    as good as the best. An unknown indicator (NaN, such as the length if no problem was solved) gets 0, like
     the worst row.
     """
     values = np.array([astuple(row) for row in rows], dtype=np.float64).reshape(len(rows), 4)
     if not len(rows):
         return values
     gains = np.where(HIGHER_IS_BETTER, values, -values)
-    minimum = np.fmin.reduce(gains, axis=0)
+    worst = np.fmin.reduce(gains, axis=0)
     best = np.fmax.reduce(gains, axis=0)
-    span = best - minimum
+    span = best - worst
     with np.errstate(invalid="ignore"):
-        share = np.where(span > 0, (gains - minimum) / np.where(span > 0, span, 1.0), 1.0)
+        share = np.where(span > 0, (gains - worst) / np.where(span > 0, span, 1.0), 1.0)
     return np.where(np.isnan(values), 0.0, share)
 
 

@@ -31,8 +31,8 @@ from robotdiffuse.robots.robot import Robot
 
 GATES = np.geomspace(0.15, 0.012, 25)
 """For each round of the estimate, the distance beyond which points are too far from the arm to count [m]."""
-MAX_POINTS = 1500
-"""Every k-th point of a view is used, with the largest k that leaves at least this many."""
+MIN_POINTS = 1500
+"""Of a view's points near the arm, every k-th is used, with the largest k that leaves at least this many."""
 MODEL_CELL = 0.01
 """One point of the arm's surface is used in each cubic cell with this edge [m]."""
 NEIGHBORS = 10
@@ -95,6 +95,7 @@ def calibrate_camera(views: Sequence[DepthView], robot: Robot) -> CameraCalibrat
     first, q = each[0]
     if any(not np.allclose(view.T_base_camera, first.T_base_camera) for view in views):
         raise InputError("views differ in T_base_camera; calibrate_camera takes views of one fixed camera")
+    # mistakes in the intrinsics are left alone: the estimate is of the pose only
     candidates = [first, *(view for _, view in mistakes(first) if view.intrinsics == first.intrinsics)]
     scores = [s * (count >= MIN_CELLS) for s, _, count in (agreement(v, robot, q) for v in candidates)]
     best = int(np.argmax(scores))
@@ -138,8 +139,8 @@ def calibrate_camera(views: Sequence[DepthView], robot: Robot) -> CameraCalibrat
 
 def arm_surface(robot: Robot, q: Configuration) -> tuple[KDTree, Points, Points]:
     """Points on the arm's surface at a configuration, as a tree and an array [m], and the normals there."""
-    balls = surface_balls(robot, q).astype(np.float64)
-    points = balls[np.unique(np.floor(balls / MODEL_CELL), axis=0, return_index=True)[1]]
+    centers = surface_balls(robot, q).astype(np.float64)
+    points = centers[np.unique(np.floor(centers / MODEL_CELL), axis=0, return_index=True)[1]]
     tree = KDTree(points)
     return tree, points, neighborhoods(points, tree, NEIGHBORS)[1][:, :, 0]
 
@@ -163,4 +164,4 @@ def _near_arm(view: DepthView, T: Pose, tree: KDTree) -> Points:
     points = DepthView(view.depth[::stride, ::stride], intrinsics, np.eye(4)).points()
     distance, _ = tree.query(placed(T, points), distance_upper_bound=2 * GATES[0])
     points = points[np.isfinite(distance)]
-    return points[:: max(1, len(points) // MAX_POINTS)]
+    return points[:: max(1, len(points) // MIN_POINTS)]

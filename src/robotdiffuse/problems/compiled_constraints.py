@@ -205,10 +205,11 @@ class PathConstraints:
         """Bounds on the third derivatives of the positions of the frames with a speed limit, on n pieces of a
         motion.
 
-        A partial derivative of a frame's position by several joints is at most as long as the lever of the
-        last of these joints in the chain. So the levers multiply sums of products of joint rates. The sum of
-        all products whose last joint is j is P(j) - P(j - 1), where P(j) is the product of the rates' sums
-        over the joints up to j.
+        By the chain rule, the third derivative of a position p is the sum of (d_j p) q'''_j,
+        3 (d_jk p) q''_j q'_k and (d_jkl p) q'_j q'_k q'_l. A partial derivative of p by several joints is at
+        most as long as the lever of the last of them in the chain. The sum of all products of rates whose
+        last joint is j is P(j) - P(j - 1), where P(j) is the product of the rates' sums over the joints up to
+        j.
 
         derivatives: bounds on the first three derivatives of the joint positions, for each piece.
         """
@@ -235,9 +236,8 @@ class PathConstraints:
         places = interpolated(s, knots, remaining)
         values = self.values(places)[:, row]
         over = values > self.rows.limit[row]
-        start = int(over.argmax())
-        end = np.flatnonzero(~over[start:])
-        return float(values[: start + (end[0] if len(end) and over[start] else len(values))].max())
+        ends = np.flatnonzero(over[:-1] & ~over[1:])  # the last places of violations
+        return float(values[: ends[0] + 1 if len(ends) else None].max())
 
     def _violation(self, row: int, at: float, value: float) -> ConstraintViolation:
         limit = float(self.rows.limit[row])
@@ -256,13 +256,16 @@ def _rows(problem: Problem, constraint: Constraint) -> list[_Row]:
         place = T @ transform((constraint.high + constraint.low) / 2)
         tolerance = float(half.min())
         return [_Row(DISTANCE, 0.0, tolerance, place, half, half - PROJECTION_FRACTION * tolerance)]
-    tolerance = constraint.tolerance
     if isinstance(constraint, CartesianLine):
         return _line_rows(problem, constraint)
-    along = constraint.normal if isinstance(constraint, OnPlane) else constraint.direction
-    flat = [np.inf, np.inf, 0.0] if isinstance(constraint, OnPlane) else [0.0, 0.0, np.inf]
-    place = transform(constraint.point, rotation_z_to(along))
-    half = np.array(flat)
+    tolerance = constraint.tolerance
+    if isinstance(constraint, OnPlane):
+        z = constraint.normal
+        half = np.array([np.inf, np.inf, 0.0])
+    else:
+        z = constraint.direction
+        half = np.array([0.0, 0.0, np.inf])
+    place = transform(constraint.point, rotation_z_to(z))
     return [_Row(DISTANCE, tolerance, tolerance, place, half, half)]
 
 
@@ -292,8 +295,9 @@ def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
             limit = min(spread + line.angle, np.pi)
             rows.append(_Row(CONE, limit, line.angle, a=T_start[:3, :3].T @ link_axis, b=direction))
     else:
-        per_length = displacement / length**2 if length > 0 else displacement
-        rows.append(_Row(TURN, line.angle, line.angle, T_start, a=turn, b=per_length))
+        # its product with a position relative to the start is the fraction of the line
+        gradient = displacement / length**2 if length > 0 else displacement
+        rows.append(_Row(TURN, line.angle, line.angle, T_start, a=turn, b=gradient))
     return rows
 
 
@@ -332,7 +336,7 @@ def rotation_vector(rotation: Rotation) -> Vector:
     angle = rotation_angle(rotation)
     if angle < 1e-12:
         return np.zeros(3)
-    # the axis is the eigenvector of eigenvalue 1, with the sign of the skew part
+    # R + R^T has the axis as the eigenvector of its largest eigenvalue; R - R^T gives the sign
     axis = np.linalg.eigh(rotation + rotation.T)[1][:, -1]
     skew = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0]])
     skew = np.append(skew, rotation[1, 0] - rotation[0, 1])
@@ -354,7 +358,8 @@ def _pose_rows(pose: PoseGoal, position: float, angle: float) -> list[_Row]:
         half = np.zeros(3) if tolerances is None else (1 - GOAL_MARGIN) * tolerances
         if kind == ROLL_PITCH_YAW:
             half = np.where(half >= (1 - GOAL_MARGIN) * np.pi, np.inf, half)
-            kind = kind if half.any() else TURN
+            if not half.any():
+                kind = TURN  # by 0: to the orientation of the pose
         rows.append(_Row(kind, limit, limit, T, half, INNER_GOAL_FRACTION * half))
     return rows
 
@@ -389,6 +394,7 @@ def _lever_bounds(robot: Robot, frame: str) -> JointValues:
     origin [m]; 1 for prismatic joints. Entries after the last joint of the chain are 0."""
     chain = list(robot.chain(frame))
     slides = np.array(robot.prismatic)[chain]
+    # the validator lets joints exceed their limits a little
     travel = np.maximum(np.abs(robot.lower), np.abs(robot.upper))[chain] + 1e-3
     lengths = np.linalg.norm(robot.frame_offsets[chain, :3, 3], axis=1) + np.where(slides, travel, 0.0)
     beyond = np.linalg.norm(robot.T_frame_link(frame)[:3, 3]) + np.cumsum(lengths[::-1])[::-1] - lengths

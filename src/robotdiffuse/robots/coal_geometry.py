@@ -1,4 +1,4 @@
-"""Converts poses and meshes to Coal's types."""
+"""Converts poses, solids and meshes to Coal's types."""
 
 # Coal's Python module has no type information.
 # pyright: reportAttributeAccessIssue=false

@@ -10,10 +10,11 @@ s̈ that is within the limits when the motion enters the interval is within them
 import numpy as np
 
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.trajectories.timing_kernel import NEGLIGIBLE_DERIVATIVE
 
 MIN_INTERVAL = 1e-10
 """A motion that begins closer than this before a grid point begins in the interval after it [rad]."""
+NEGLIGIBLE_DERIVATIVE = 1e-7
+"""Components of q' below this count as zero; the norm of q' is 1 on straight lines."""
 STILL_SPEED_SQUARED = 1e-12
 """ṡ² below this counts as rest [rad²/s²]."""
 

@@ -26,8 +26,8 @@ joint exceeded its limit by 1.8 % where it reversed its direction."""
 # for straight lines. Accelerations get the square of a factor.
 CURVE_MARGIN = 1.0002
 ROUNDING_MARGIN = 1 + 1e-9
-NEGLIGIBLE_DERIVATIVE = 1e-7
-"""Components of q' below this count as zero; the norm of q' is 1 on straight lines."""
+START_SLACK = 1e-7
+"""Fraction by which ṡ² at the start may exceed the greatest from which the end can be reached."""
 NEGLIGIBLE_SHARE = 1e-8
 """The next ṡ² is ignored in a limit if it contributes less than this fraction of an acceleration limit."""
 BLEND_DEVIATION = 3.0 / 16.0
@@ -48,7 +48,7 @@ class RoundedLine(NamedTuple):
     polyline.
 
     The parameter s is the arc length of the polyline. Corner i is the waypoint w_i at s_i, with the half
-    width d_i and the unit directions e before and f behind it. The blend is w_i + d_i (e u + (f - e) b(u)),
+    width d_i and the unit directions e before and f after it. The blend is w_i + d_i (e u + (f - e) b(u)),
     with u = (s - s_i) / d_i in [-1, 1]. Here b(u) is a C2 replacement of max(u, 0) with the second derivative
     3/4 (1 - u²). The blend leaves the polyline by at most 3/16 d_i |f - e|, at u = 0.
     """
@@ -182,6 +182,7 @@ def timing_grid(knots, half_widths, corner_intervals, line_intervals):
     """
     length = knots[-1]
     corners = len(half_widths)
+    # a part has at most its least number of intervals plus its share, rounded
     grid = np.zeros(1 + line_intervals + (2 + corner_intervals) * (corners + 1) + corners + 1)
     count = 0
     s = 0.0
@@ -226,7 +227,7 @@ def estimated_time(line, velocity, acceleration):
                 limit = min(limit, acceleration[j] / abs(second[i, j]))
         x[i] = limit
     x[0] = x[n - 1] = 0.0
-    # x grows by 2 width s̈ in an interval: braking limits (backward), then speeding up (forward)
+    # x grows by 2 width s̈ in an interval; the backward pass limits braking, the forward pass speeding up
     for i in range(n - 1, 0, -1):
         limit = x[i] + 2 * (grid[i] - grid[i - 1]) * _greatest_u(first, second, i, x[i], -1.0, acceleration)
         x[i - 1] = min(x[i - 1], limit)
@@ -344,15 +345,15 @@ def fastest_speeds(first, second, grid, velocity, lowest, highest, start_speed=0
     max_x = controllable(first, second, grid, velocity, lowest, highest)
     speeds = np.zeros(n)
     x = start_speed * start_speed
-    if x > max_x[0] * (1 + NEGLIGIBLE_DERIVATIVE):
+    if x > max_x[0] * (1 + START_SLACK):
         speeds[:] = np.nan
         return speeds
     for i in range(n - 1):
         speeds[i] = np.sqrt(x)
         width = grid[i + 1] - grid[i]
         high, slope = _bounds_of_next(first, second, i, width, x, max_x[i + 1], lowest, highest)[2:4]
-        # Rounding errors must not stop the motion: at least this next x is possible, because the backward
-        # pass ensured it from max_x[i], and in proportion from a smaller x.
+        # Rounding errors must not stop the motion, so the next x is at least the one that the backward pass
+        # made possible: this fraction of max_x[i] from there, and proportionally less from a smaller x.
         min_next = MIN_SPEED_RATIO * x * min(1.0, max_x[i + 1] / max_x[i])
         x = min(max(high + slope * x, min_next), max_x[i + 1])
     return speeds

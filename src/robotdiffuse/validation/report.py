@@ -38,13 +38,14 @@ class Report:
     """The result of a validation."""
 
     valid: bool
-    violation: Violation | Any
+    violation: Violation | Any  # Any stands for None, so that its fields can be read without a check
     """The first violation; None if and only if the motion is valid."""
     scene_clearance: float | None
     """Certified lower bound on the distance of all moving links to all obstacles over the whole motion [m],
     at most 1 m. None for an invalid motion."""
     self_clearance: float | None
-    """Lower bound on the distance between links that are checked against each other [m]."""
+    """Lower bound on the distance between links that are checked against each other [m]; None for an invalid
+    motion."""
     jerk_share: float | None = None
     """The largest jerk of a valid trajectory, divided by the joint's limit (`jerk_limits`); infinite if the
     acceleration is not 0 at the start or the end. Jerk limits are no requirement: a motion with a share above
