@@ -125,13 +125,15 @@ ball, box, cloud = rd.Sphere([1, 0, 0], 0.1, "ball"), rd.Box([1, 0, 0], [1, 1, 1
 robot, scene, moving = rd.load_robot("panda"), rd.Scene([ball]), rd.MovingObstacle(ball, velocity=[1, 0, 0])
 space = rd.Workspace(robot)
 space.add(ball)
+goal, view = rd.PoseGoal("panda_hand", np.eye(4)), rd.DepthView.from_cloud(np.ones((9, 3)), np.eye(4))
+things = (ball, box, cloud, scene, moving, goal, view)
 two = np.array(["panda_hand", "panda_link7"])
 calls = [(rd.Scene, [ball], {"ball": two}), (space.allow, "ball", two), (robot.with_tool, "panda_hand", np.eye(4), (), (), two)]
 for name in (two, ["panda_hand"], {}, ""):
     calls += [(robot.attach, box, name), (scene.attach, "ball", robot, np.zeros(7), name), (space.pose, "ready", name)]
     calls += [(robot.fk, np.zeros(7), name), (robot.jacobian, np.zeros(7), name), (rd.Workspace, robot, name)]
 for T in (np.eye(3), 2 * np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0]), "T"):
-    calls += [(thing.moved, T) for thing in (ball, box, cloud, scene, moving)] + [(robot.with_tool, "panda_hand", T)]
+    calls += [(thing.moved, T) for thing in things] + [(robot.with_tool, "panda_hand", T)]
 for call, *arguments in calls:
     try:
         call(*arguments)
@@ -139,7 +141,7 @@ for call, *arguments in calls:
         assert len(str(error).splitlines()) == 1
     else:
         raise AssertionError((call, arguments))
-for thing in (ball, box, cloud, scene, moving):
+for thing in things:
     thing.moved(np.eye(4).tolist())
 """
 

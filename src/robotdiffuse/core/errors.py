@@ -206,6 +206,8 @@ MAX_DURATION = 1e6
 RIGID_SLACK = 1e-4
 """Largest allowed error of a pose matrix: of each entry of R R^T against the identity, and of each entry of
 the last row against LAST_ROW."""
+MOTION_SLACK = 1e-3
+"""Largest allowed error of the matrix of a rigid motion, often a product of poses; see RIGID_SLACK."""
 LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 
 

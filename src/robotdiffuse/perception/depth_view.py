@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from robotdiffuse.core.errors import (
     MAX_COORDINATE,
     MAX_RATE,
+    MOTION_SLACK,
     InputError,
     check_type,
     form,
@@ -153,7 +154,11 @@ class DepthView(Value):
 
         Returns:
             The view after the motion.
+
+        Raises:
+            InputError: If T is not a rigid motion.
         """
+        T = rigid_transform("T", T, MOTION_SLACK)
         cloud = None if self.cloud is None else placed(T, self.cloud)
         return replace(self, T_base_camera=T @ self.T_base_camera, cloud=cloud)
 

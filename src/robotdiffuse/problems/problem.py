@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from robotdiffuse.core.errors import (
     MAX_COORDINATE,
     MIN_RATE,
+    MOTION_SLACK,
     InputError,
     check_list,
     check_name,
@@ -134,7 +135,11 @@ class PoseGoal(Value):
 
         Returns:
             The goal after the motion.
+
+        Raises:
+            InputError: If T is not a rigid motion.
         """
+        T = rigid_transform("T", T, MOTION_SLACK)
         return replace(self, T_base_frame=T @ self.T_base_frame)
 
     @property
