@@ -103,10 +103,23 @@ def test_obstacles_and_held_objects_count(made: Planner) -> None:
     assert made.IK(POSE, QPOS)[0].startswith("IK Failed!")
     assert made.remove_point_cloud() and not made.remove_point_cloud()
     made.update_attached_box([0.05, 0.05, 0.1], [0, 0, 0.15, 1, 0, 0, 0])
-    assert [body.name for body in made.workspace.robot.attached] == ["attached"]
+    assert [body.name for body in made.workspace.robot.attached] == ["attached_geom"]
     assert made.check_for_self_collision(QPOS) == []
     assert made.plan_pose(POSE, QPOS, planning_time=10.0)["status"] == "Success"
     assert made.detach_object() and not made.detach_object()
+
+
+def test_clouds_and_held_objects_have_the_names_of_mplib(made: Planner) -> None:
+    """Regression: `remove_point_cloud("scene_pcd")` and `detach_object("attached_geom")` found nothing, and both stayed."""
+    made.update_point_cloud(np.array([[2.0, 2.0, 2.0]]))
+    made.update_attached_sphere(0.02, [0, 0, 0.15, 1, 0, 0, 0])
+    assert made.remove_point_cloud("scene_pcd") and made.detach_object("attached_geom")
+
+
+def test_an_empty_option_has_no_effect(made: Planner) -> None:
+    """Regression: MPlib 0.1's default `fixed_joint_indices=[]` was refused."""
+    assert made.plan_qpos([QPOS], QPOS, fixed_joint_indices=[], constraint_function=None)["status"] == "Success"
+    refuses("unknown option 'fixed_joint_indices'", made.plan_qpos, [QPOS], QPOS, fixed_joint_indices=[0])
 
 
 def test_the_base_stands_in_the_world(made: Planner) -> None:

@@ -45,8 +45,9 @@ from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Sphere
 from robotdiffuse.validation.tolerances import DEFAULT
 
 SUCCESS = "Success"
-CLOUD = "point_cloud"
-HELD = "attached"
+# MPlib's names
+CLOUD = "scene_pcd"
+HELD = "attached_geom"
 # Jerk limits let the acceleration reach its limit within this time [s], since MPlib has no jerk limits.
 RAMP_TIME = 0.01
 # The last row is repeated for this time [s], in which position controllers reach it.
@@ -150,7 +151,7 @@ class Planner:
 
     @joint_vel_limits.setter
     def joint_vel_limits(self, values: ArrayLike) -> None:
-        self._limit(values, self.robot.acceleration)
+        self.workspace.robot = _limited(self.robot, values, self.robot.acceleration)
 
     @property
     def joint_acc_limits(self) -> ndarray:
@@ -159,10 +160,7 @@ class Planner:
 
     @joint_acc_limits.setter
     def joint_acc_limits(self, values: ArrayLike) -> None:
-        self._limit(self.robot.velocity, values)
-
-    def _limit(self, velocity: ArrayLike, acceleration: ArrayLike) -> None:
-        self.workspace.robot = _limited(self.robot, velocity, acceleration)
+        self.workspace.robot = _limited(self.robot, self.robot.velocity, values)
 
     def set_base_pose(self, pose: Any) -> None:
         """Place the base in the world. Obstacles stay where they are in the world.
@@ -314,18 +312,21 @@ class Planner:
             result = self.workspace.plan_line(T, start, **request)
             if result.solved:
                 return result
+
+            def noted(other: PlanResult, note: str) -> PlanResult:
+                return replace(other, notes=(*other.notes, note)) if other.solved else result
+
             if len(self.workspace.ik(T, near=start, count=1)):
                 uneven = self.workspace.plan_line(T, start, LOOSE_TOLERANCE, None, **request)
-                note = "no motion turns evenly along the line; this one turns otherwise"
-                return replace(uneven, notes=(*uneven.notes, note)) if uneven.solved else result
+                return noted(uneven, "no motion turns evenly along the line; this one turns otherwise")
             tilt = self._tilt(T, start)
             angle = np.linalg.norm(tilt)
             if angle > DEFAULT.goal_angle:
                 return result
             turned = transform(T[:3, 3], Rotation.from_rotvec(tilt).as_matrix() @ T[:3, :3])
             tilted = self.workspace.plan_line(turned, start, **request)
-            note = f"the pose is out of reach; the motion ends tilted by {np.degrees(angle):.1f} degrees"
-            return replace(tilted, notes=(*tilted.notes, note)) if tilted.solved else result
+            degrees = np.degrees(angle)
+            return noted(tilted, f"the pose is out of reach; the motion ends tilted by {degrees:.1f} degrees")
 
         return self._planned("screw plan failed", plan, qpos, options)
 
@@ -345,11 +346,8 @@ class Planner:
 
     def _state(self, arguments: Sequence[Any], options: dict[str, Any]) -> ndarray:
         """The planned joints of the configuration among the arguments of a check."""
-        if "qpos" in options:
-            return self._start(options["qpos"])
-        if "state" in options:
-            return self._start(options["state"])
-        return self._start(arguments[:2][-1] if arguments else ())
+        unnamed = arguments[:2][-1] if arguments else ()
+        return self._start(options.get("qpos", options.get("state", unnamed)))
 
     def _planned(
         self, failed: str, plan: Callable[..., PlanResult], qpos: ArrayLike, options: dict[str, Any]
@@ -358,7 +356,7 @@ class Planner:
         the start. The last row is repeated for SETTLING_TIME, since scripts grasp and release right after
         the motion."""
         for name, value in options.items():
-            if value is not None:
+            if value is not None and np.size(value):  # MPlib 0.1: fixed_joint_indices=[]
                 check_name("option", name, OPTIONS)
         start = self._start(qpos)
         step = options.get("time_step", 0.1)
