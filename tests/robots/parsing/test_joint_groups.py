@@ -27,6 +27,7 @@ END = {
         chain("j6_link", ["left_jaw"]) + link("tcp", "") + joint("tool", "j6_link", "tcp", "fixed"),
         "j6_link",
     ),
+    "a jaw that only its link names": (link("arm_fngr") + joint("f1x", "j6_link", "arm_fngr"), "j6_link"),
     "a gripper of one joint that five follow": (
         chain("j6_link", ["drive"])
         + "".join(

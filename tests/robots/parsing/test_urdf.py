@@ -165,7 +165,7 @@ def test_limits_file(tmp_path: Path) -> None:
     file.write_text(
         "joint_limits:\n"
         "  turn: {has_velocity_limits: true, max_velocity: 2, has_jerk_limits: false, max_jerk: 1}\n"
-        "  bend: {max_acceleration: 3.5, min_position: -1}\n"
+        "  bend: {max_acceleration: 3.5, min_position: -1, has_jerk: false}\n"  # as KUKA's files have it
     )
     robot = with_limits(read_urdf(urdf(tmp_path)), read_limits(file)[0])
     np.testing.assert_allclose(robot.velocity, [2, 1])
@@ -257,6 +257,15 @@ def test_a_wheel_without_limits_is_held_and_a_planned_joint_without_limits_is_re
     refuses("made.urdf: wheel_joint: no <limit lower= upper=>; add it", read_urdf, file, tip="wheel")
     held = chain("base", ["j1"], limits=""), chain("j1_link", ["j2"])
     assert read_urdf(written(tmp_path, *held), locked={"j1": 1.0}).joint_names == ("j2",)
+
+
+def test_limits_beyond_all_measure_stand_for_none(tmp_path: Path) -> None:
+    """Regression: iCub (1e9 rad/s) and a drone's propellers (revolute, within 1e16 rad) were refused."""
+    fast = chain("base", ["j"]).replace('velocity="2"', 'velocity="1e+9"')
+    propeller = link("propeller") + joint("turn", "base", "propeller", limits='lower="0.5" upper="1e+16"')
+    robot = read_urdf(written(tmp_path, fast, propeller), tip="j_link")
+    assert robot.velocity == [1.0] and robot.locked == {"turn": 0.0}
+    assert "no velocity limit for j; 1 assumed" in robot.notes
 
 
 def test_soft_limits_are_noted(tmp_path: Path) -> None:

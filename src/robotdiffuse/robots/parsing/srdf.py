@@ -8,7 +8,7 @@ import math
 import re
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
-from itertools import takewhile
+from os.path import commonprefix
 from pathlib import Path
 from typing import NamedTuple
 
@@ -169,6 +169,9 @@ BOTH = "both"
 """Name of the group of all arms of a robot with two arms."""
 ALL = "all"
 """Name of the group of all arms, for any number of arms from two on."""
+FINGER = re.compile("finger|fngr|jaw|claw|knuckle|thumb", re.IGNORECASE)
+"""Matches names of links that are moved by the last joint of an arm with at least MIN_ARM_JOINTS other
+joints. This joint then counts as a gripper joint, whatever its name."""
 SUFFIX_CHARACTERS = "_-/0123456789 "
 """Characters stripped from the end of the common prefix of an arm's joint names."""
 MAX_FINGER_JOINTS = 2
@@ -195,9 +198,8 @@ class Arm(NamedTuple):
     def name(self) -> str:
         """The common prefix of the names of the arm's own joints; the name of the tip if there is no common
         prefix."""
-        columns = zip(*self.joints[-self.own_joints :], strict=False)
-        common_letters = takewhile(lambda letters: len({*letters}) == 1, columns)
-        common = "".join(letters[0] for letters in common_letters).rstrip(SUFFIX_CHARACTERS)
+        joints = self.joints[-self.own_joints :]
+        common = commonprefix(joints).rstrip(SUFFIX_CHARACTERS)  # noqa: RUF071  (characters, not folders)
         return common.removesuffix("joint").rstrip("_-/ ") or self.tip
 
 
@@ -262,9 +264,11 @@ class JointTree:
         branching, and `before` is the last of these."""
         lengths = [self._chain_length(joint) for joint in branches]
         if len(branches) == 1:
-            words = [len(GRIPPER.findall(name)) for name in (before, branches[0].name)]
-            jaw = branches[0].kind in MOVING_KINDS and words[0] < words[1]
-            return jaw and lengths[0] <= MAX_HAND_FINGER_JOINTS
+            [joint] = branches
+            words = [len(GRIPPER.findall(name)) for name in (before, joint.name)]
+            finger = lengths == [1] and own_joints >= MIN_ARM_JOINTS and FINGER.search(joint.child)
+            jaw = finger or (words[0] < words[1] and lengths[0] <= MAX_HAND_FINGER_JOINTS)
+            return bool(jaw) and joint.kind in MOVING_KINDS
         if len(branches) == 2:
             return max(lengths) <= MAX_FINGER_JOINTS
         hand = own_joints >= MIN_ARM_JOINTS and sum(length >= LIMB_JOINTS for length in lengths) not in (1, 2)

@@ -108,27 +108,29 @@ class UrdfTree:
 
     def __post_init__(self) -> None:
         self.packages = Packages(self.path, self.folders)
-        self.text = with_prefixes(read_bytes(self.path, "URDF"))
-        root = parse_xml(self.text, str(self.path))
+
+        def parsed(text: bytes) -> ET.Element:
+            self.text = with_prefixes(text)
+            return parse_xml(self.text, str(self.path))
+
+        root = parsed(read_bytes(self.path, "URDF"))
         if is_xacro(self.path, root):
             if not self.compile_xacro:
                 raise InputError(
                     f"{self.path} is a xacro file, and compiling it would run code in it; if you trust it, "
                     f"prepare it first: robotdiffuse robot add {self.path} --name NAME, and use that name"
                 )
-            self.text = with_prefixes(compiled_xacro(self.path, self.packages))
+            root = parsed(compiled_xacro(self.path, self.packages))
             self.notes.append(
                 f"{self.path.name} was compiled by xacro, which runs the code in its expressions"
             )
-            root = parse_xml(self.text, str(self.path))
         if root.tag == "mujoco":
             model = ConvertedModel(self.path)
-            self.text = model.urdf
+            root = parsed(model.urdf)
             self.semantics = model.semantics
             self.notes += model.notes
             self._mesh_folder = model.folder  # removed with this object
             self.packages = Packages(Path(model.folder.name, self.path.name), {})
-            root = parse_xml(self.text, str(self.path))
         if root.tag != "robot":
             raise InputError(
                 f"{self.path} is neither a URDF nor a MuJoCo model: its root element is <{root.tag}>, not "
@@ -437,13 +439,12 @@ class UrdfTree:
         return Mimic(leaders[1], float(multiplier[0]), float(offset[0]))
 
     def _with_limits(self, joint: Joint, attributes: dict[str, str]) -> Joint:
-        largest = {"lower": MAX_COORDINATE, "upper": MAX_COORDINATE, "velocity": MAX_RATE}
-        if joint.kind == "continuous":  # its position limits are ignored
-            largest = {"velocity": MAX_RATE}
+        stated = {name: text for name, text in attributes.items() if not _is_endless(text)}
+        ranged = joint.kind != "continuous" and {"lower", "upper"}.isdisjoint(attributes.keys() - stated)
         limits = {
-            name: float(self._numbers(attributes[name], 1, f"joint {joint.name}: {name} limit", bound)[0])
-            for name, bound in largest.items()
-            if name in attributes
+            name: float(self._numbers(stated[name], 1, f"joint {joint.name}: {name} limit")[0])
+            for name in (("lower", "upper", "velocity") if ranged else ("velocity",))
+            if name in stated
         }
         if joint.kind == "continuous":
             limits |= {"lower": -CONTINUOUS_LIMIT, "upper": CONTINUOUS_LIMIT}
@@ -613,6 +614,13 @@ class UrdfTree:
         return transform(xyz, rotation_from_quaternion(np.array([w, x, y, z])))
 
 
+def _is_endless(limit: str) -> bool:
+    """Whether a limit is so large, such as 1e16 or inf, that it stands for none."""
+    with suppress(ValueError):
+        return abs(float(limit)) > MAX_COORDINATE
+    return False
+
+
 def _attributes(element: ET.Element, tag: str) -> dict[str, str]:
     """Attributes of an element's child; none if there is no such child."""
     child = element.find(tag)
@@ -620,7 +628,7 @@ def _attributes(element: ET.Element, tag: str) -> dict[str, str]:
 
 
 # FIELDS: MoveIt's fields of joint_limits.yaml, and those of `Joint`. FACTORS: MoveIt's fields that are
-# ignored with a note. FLAGS: MoveIt's fields that switch limits off.
+# ignored with a note. FLAG: prefix of fields that switch limits off, such as has_jerk_limits and others.
 FIELDS = {
     "min_position": "lower",
     "max_position": "upper",
@@ -629,12 +637,7 @@ FIELDS = {
     "max_jerk": "jerk",
 }
 FACTORS = ("default_velocity_scaling_factor", "default_acceleration_scaling_factor")
-FLAGS = (
-    "has_position_limits",
-    "has_velocity_limits",
-    "has_acceleration_limits",
-    "has_jerk_limits",
-)
+FLAG = "has_"
 
 
 def read_limits(file: str | Path) -> tuple[dict[str, dict[str, float]], tuple[str, ...]]:
@@ -684,7 +687,7 @@ def _fields(file: str, joint: str, entry: object) -> dict[str, float]:
         raise InputError(f"{file}: joint_limits of {joint} is {shown(entry)}; it must be a mapping")
     fields: dict[str, float] = {}
     for key, value in entry.items():
-        if key in FLAGS:
+        if str(key).startswith(FLAG):
             continue
         check_name(f"field of {joint} in {file}", key, FIELDS)
         kind = "position" if key.endswith("position") else key.removeprefix("max_")
