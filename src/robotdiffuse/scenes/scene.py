@@ -1,6 +1,7 @@
 """Scene: the static obstacles around a robot."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import replace as dataclass_replace
 from functools import cached_property
 from typing import Any
@@ -94,10 +95,11 @@ class Scene(Value):
 
         Returns:
             The scene. A plane, which is infinite in MuJoCo whatever its size, becomes a box with edges of at
-            least 10 m. Meshes are replaced by their convex hulls, as MuJoCo does.
+            least 10 m around the base. Meshes are replaced by their convex hulls, as MuJoCo does.
 
         Raises:
-            InputError: For an unknown body, and for soft bodies, height fields and signed distance fields.
+            InputError: For an unknown body, for soft bodies, height fields and signed distance fields, and if
+                `base` is "world" and a free joint, or a slide without a range, has moved the robot.
         """
         return cls(_mujoco_shapes(model, data, base))
 
@@ -253,17 +255,21 @@ def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
     if model.nflex:
         flex = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, 0)
         raise InputError(f"flex {flex} is soft; obstacles must be rigid: use geoms in its place")
-    placed = mujoco.MjData(model)
-    if data is not None:
-        placed.qpos[:] = data.qpos
-        placed.mocap_pos[:] = data.mocap_pos
-        placed.mocap_quat[:] = data.mocap_quat
+    placed = mujoco.MjData(model) if data is None else copy(data)
     mujoco.mj_kinematics(model, placed)
     bodies = [model.body(k).name for k in range(model.nbody)]
     check_name("body", base, bodies)
     base_body = bodies.index(base)
+    robot_bodies = mjcf.robot_bodies(model)
+    placing = np.isin(model.dof_jntid, [*mjcf.placing_joints(model, robot_bodies)])
+    change = np.zeros(model.nv)
+    mujoco.mj_differentiatePos(model, change, 1.0, model.qpos0, placed.qpos)
+    if base == "world" and (np.abs(change[placing]) > 1e-4).any():  # [m] or [rad]
+        raise InputError(
+            "data moves the robot, which is held where the model places it; take a body that moves with it "
+            "as the base, here by base=BODY and in `robot add` by --base BODY"
+        )
     T_base_world = inverse(transform(placed.xpos[base_body], placed.xmat[base_body].reshape(3, 3)))
-    robot_bodies = set(mjcf.robot_bodies(model))
     colliding = mjcf.colliding_geoms(model)
     shapes: list[Shape] = []
     for geom in range(model.ngeom):
@@ -275,12 +281,11 @@ def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
         center = T[:3, 3]
         wxyz = quaternion_from_rotation(T[:3, :3])
         size = model.geom_size[geom]
-        surface = None
         match mjcf.kind_of("Geom", model.geom_type[geom]):
             case "plane":
-                edges = np.maximum(2 * size[:2], PLANE_SIZE)
-                below = center - T[:3, 2] * PLANE_DEPTH / 2
-                shapes.append(Box(below, [*edges, PLANE_DEPTH], wxyz, name))
+                normal = T[:3, 2]
+                below = normal * (normal @ center - PLANE_DEPTH / 2)  # centered under the base
+                shapes.append(Box(below, [*np.maximum(2 * size[:2], PLANE_SIZE), PLANE_DEPTH], wxyz, name))
             case "sphere":
                 shapes.append(Sphere(center, float(size[0]), name))
             case "box":
@@ -288,15 +293,16 @@ def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
             case "capsule" | "cylinder" as kind:
                 shape = Capsule if kind == "capsule" else Cylinder
                 shapes.append(shape(center, float(size[0]), float(2 * size[1]), wxyz, name))
-            case "ellipsoid":
-                surface = mjcf.ellipsoid(size)
-            case "mesh":  # MuJoCo collides with the hull
-                surface = mjcf.mesh_of(model, int(model.geom_dataid[geom])).convex_hull
+            case "ellipsoid" | "mesh" as kind:  # MuJoCo collides with the hull
+                solid = (
+                    mjcf.ellipsoid(size)
+                    if kind == "ellipsoid"
+                    else mjcf.mesh_of(model, int(model.geom_dataid[geom])).convex_hull
+                )
+                shapes.append(Mesh(solid.vertices, solid.faces, center, wxyz, name=name))
             case kind:
                 raise InputError(
                     f"geom {name} is of type {kind}; obstacles may be planes, spheres, capsules, ellipsoids, "
                     "cylinders, boxes and meshes"
                 )
-        if surface is not None:
-            shapes.append(Mesh(surface.vertices, surface.faces, center, wxyz, name=name))
     return shapes

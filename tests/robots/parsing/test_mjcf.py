@@ -304,6 +304,34 @@ def test_a_base_on_slides_without_range_is_held(actuator: str, tmp_path: Path) -
     np.testing.assert_allclose(robot.fk(np.array([0.0]), "base")[:3, 3], [0.1, 0, 0.2], atol=1e-12)
 
 
+def test_a_scene_around_a_robot_that_has_moved_names_its_base(tmp_path: Path) -> None:
+    """Regression: obstacles were where the simulation has them, but the robot where its model places it."""
+    box = '<geom name="box" size="0.1 0.1 0.1" type="box" pos="1.1 0 0.2"/>'
+    model = mujoco.MjModel.from_xml_string(PLACED.replace("<worldbody>", f"<worldbody>{box}"))
+    data = mujoco.MjData(model)
+    data.qpos[1] = 0.5  # a joint that is planned
+    assert len(rd.Scene.from_mujoco(model, data).shapes) == 1
+    data.qpos[0] += 0.4
+    refuses("data moves the robot, which is held where", rd.Scene.from_mujoco, model, data)
+    [shape] = rd.Scene.from_mujoco(model, data, base="base").shapes
+    np.testing.assert_allclose(shape.center, [0.6, 0, 0], atol=1e-12)
+
+
+def test_a_plane_has_no_ends() -> None:
+    """Regression: a floor drawn as a small square was an obstacle of this size, but in MuJoCo nothing passes it anywhere."""
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody>
+      <geom name="floor" type="plane" size="0.1 0.1 0.1" pos="7 0 -0.2"/>
+      <geom name="ramp" type="plane" size="0 0 0.1" pos="3 0 0" euler="0 30 0" contype="2" conaffinity="0"/>
+      <body pos="-2 0 0.29"><freejoint/><geom size="0.5"/></body></worldbody></mujoco>""")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert data.contact.dist == pytest.approx([-0.01])
+    floor, ramp, _ = rd.Scene.from_mujoco(model, data).shapes
+    np.testing.assert_allclose(floor.bounds, [[-5, -5, -0.3], [5, 5, -0.2]], atol=1e-12)
+    normal = np.array([0.5, 0, np.sqrt(0.75)])
+    np.testing.assert_allclose(ramp.center, (1.5 - 0.05) * normal, atol=1e-12)  # the plane is 1.5 m from the base
+
+
 def test_a_free_body_with_joints_is_the_robot_if_nothing_else_is(tmp_path: Path) -> None:
     """Regression: a humanoid without actuators "has no robot: no body is moved by a hinge or a slide joint"."""
     free = '<joint name="x" type="free"/>'

@@ -29,7 +29,6 @@ from robotdiffuse.core.types import Pose, Values, Vector
 from robotdiffuse.robots.fitting.convex_parts import convex_hull
 from robotdiffuse.robots.parsing.srdf import Srdf
 
-MOVABLE = ("hinge", "slide")
 GEOMS = ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 """Types of geoms that are converted: ellipsoids to meshes, the others to elements that `urdf.py` reads."""
 WORLD = 0
@@ -89,21 +88,20 @@ def robot_bodies(model: Any) -> list[int]:
         if kind_of("Trn", model.actuator_trntype[k]) in ("joint", "jointinparent")
     }
     if not chosen:
-        moving = {*roots[np.isin(kinds, MOVABLE)]}
+        moving = {*roots[np.isin(kinds, ("hinge", "slide"))]}
         chosen = moving - {*roots[np.isin(kinds, "free")]} or moving
     return np.flatnonzero(np.isin(model.body_rootid, [*chosen])).tolist()
 
 
 def placing_joints(model: Any, bodies: list[int]) -> set[int]:
-    """The joints that only place the base: slide joints without a range, if the robot has other joints
-    too."""
+    """The joints that only place the base: free joints, and slide joints without a range if the robot has
+    other joints too."""
     joints = _joints_of(model, bodies)
-    unlimited = {
-        joint
-        for joint in joints
-        if kind_of("Joint", model.jnt_type[joint]) == "slide" and not model.jnt_limited[joint]
-    }
-    return unlimited if len(unlimited) < len(joints) else set()
+    free, slides = (
+        {k for k in joints if kind_of("Joint", model.jnt_type[k]) == kind and not model.jnt_limited[k]}
+        for kind in ("free", "slide")
+    )
+    return free | slides if len(slides) < len(joints) else free
 
 
 def kind_of(enumeration: str, value: Any) -> str:
@@ -184,12 +182,9 @@ class ConvertedModel:
         for joint in joints:
             label = self.joint_name(joint)
             kind = self.joint_kind(joint)
-            if kind == "free" or joint in self.held:
-                held = (
-                    f"slide joint {label}, which has no range,"
-                    if kind == "slide"
-                    else f"the free joint of {name}"
-                )
+            if joint in self.held:
+                slide = f"slide joint {label}, which has no range,"
+                held = slide if kind == "slide" else f"the free joint of {name}"
                 self.notes.append(f"{held} is held where the model places it")
                 continue
             if kind == "ball":
@@ -226,7 +221,7 @@ class ConvertedModel:
         ET.SubElement(element, "axis", xyz=_text(model.jnt_axis[joint]))
         limits = {"effort": repr(self._effort(joint))}
         if limited:
-            limits |= zip(("lower", "upper"), map(repr, model.jnt_range[joint].tolist()), strict=True)
+            limits["lower"], limits["upper"] = map(repr, model.jnt_range[joint].tolist())
         ET.SubElement(element, "limit", limits)
         if joint in self.mimics:
             ET.SubElement(element, "mimic", self.mimics[joint])
@@ -381,7 +376,7 @@ class ConvertedModel:
         places = {
             self.joint_name(joint): model.jnt_qposadr[joint]
             for joint in _joints_of(model, self.bodies)
-            if self.joint_kind(joint) in MOVABLE and joint not in self.held
+            if joint not in self.held
         }
         return {
             self.name("key", key): {name: float(model.key_qpos[key, place]) for name, place in places.items()}
