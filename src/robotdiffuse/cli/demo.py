@@ -50,7 +50,9 @@ def run_demo(arguments: Namespace) -> int:
     true_problem = problem
     if arguments.camera:
         outputs.append(check_output("demo_true.png", VIEW_ENDINGS))
-        problem = seen_by_camera(true_problem)
+        # one depth view from beside the arm in place of the scene; the floor stays known
+        view = seen_from_beside(replace(problem, scene=Scene([FLOOR, *problem.scene.shapes])))
+        problem = replace(problem, scene=Scene([FLOOR]), views=(view,), unknown=PREDICTED)
     result = load_and_plan(problem, DEFAULT_PLANNER, picture=True, time_limit=TIME_LIMIT)
     print_result(result, asked_clearance(problem, DEFAULT_PLANNER))
     if result.trajectory is None or result.path is None:
@@ -100,10 +102,3 @@ def shelf_problem(robot: str) -> Problem:
             if result.solved and result.stage != "straight_line":
                 return problem
     return problem
-
-
-def seen_by_camera(problem: Problem) -> Problem:
-    """The problem with one depth view in place of its scene, from beside the arm and behind its shoulder. The
-    floor stays known."""
-    view = seen_from_beside(replace(problem, scene=Scene([FLOOR, *problem.scene.shapes])))
-    return replace(problem, scene=Scene([FLOOR]), views=(view,), unknown=PREDICTED)

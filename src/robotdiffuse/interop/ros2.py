@@ -127,11 +127,12 @@ def _value(definition: Any, value: Any) -> Any:
 
 def to_plain(message: Any) -> dict[str, Any]:
     """A message as plain data."""
-    return asdict(message, dict_factory=_with_lists)
-
-
-def _with_lists(items: list[tuple[str, Any]]) -> dict[str, Any]:
-    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in items}
+    return asdict(
+        message,
+        dict_factory=lambda items: {
+            name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in items
+        },
+    )
 
 
 def joint_state(robot: Robot, q: Configuration, at: int) -> dict[str, Any]:
