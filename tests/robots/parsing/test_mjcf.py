@@ -317,8 +317,8 @@ def test_a_scene_around_a_robot_that_has_moved_names_its_base(tmp_path: Path) ->
     np.testing.assert_allclose(shape.center, [0.6, 0, 0], atol=1e-12)
 
 
-def test_a_plane_has_no_ends() -> None:
-    """Regression: a floor drawn as a small square was an obstacle of this size, but in MuJoCo nothing passes it anywhere."""
+def test_planes_are_boxes_around_the_base() -> None:
+    """Regression: a floor drawn far from the robot was an obstacle only there, but in MuJoCo nothing passes it anywhere."""
     model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody>
       <geom name="floor" type="plane" size="0.1 0.1 0.1" pos="7 0 -0.2"/>
       <geom name="ramp" type="plane" size="0 0 0.1" pos="3 0 0" euler="0 30 0" contype="2" conaffinity="0"/>
