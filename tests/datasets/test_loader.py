@@ -172,3 +172,12 @@ def test_a_motion_that_uses_the_whole_range_of_the_first_joint_stays():
 @pytest.mark.parametrize(("name", "vertical"), [("panda", True), ("ur5", True), ("awkward", False)])
 def test_which_robots_turn(name, vertical):
     assert shards.turns_about_vertical(example_robot(name)) is vertical
+
+
+def test_clouds_are_float32_whatever_the_default_type_of_pytorch_is(store):
+    expected = RopDataset(store, "train", points=8)[0]["points"]
+    torch.set_default_dtype(torch.float64)
+    try:
+        torch.testing.assert_close(RopDataset(store, "train", points=8)[0]["points"], expected, atol=0, rtol=0)
+    finally:
+        torch.set_default_dtype(torch.float32)

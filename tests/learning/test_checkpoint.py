@@ -115,3 +115,16 @@ def test_a_network_reads_no_other_file(tmp_path: Path, monkeypatch: pytest.Monke
     (tmp_path / "w.bin").write_bytes(ones.tobytes())
     monkeypatch.chdir(tmp_path)
     refuses(r"outside\.onnx keeps weights in another file", OnnxNetwork, model.SerializeToString(), "outside.onnx")
+
+
+def test_the_default_type_of_pytorch_changes_no_network_that_is_read(tmp_path):
+    """Regression: with float64 as the default, the planners mpnet and mpinets raised a RuntimeError."""
+    save_small_model(tmp_path)
+    before = checkpoint.fingerprint(checkpoint.load_network("model", tmp_path, box_arm()))
+    torch.set_default_dtype(torch.float64)
+    try:
+        os.utime(tmp_path / "model.json", (0, 0))  # else the network that was read before is used again
+        loaded = checkpoint.load_network("model", tmp_path, box_arm())
+        assert checkpoint.fingerprint(loaded) == before and loaded.encode(cloud(50)[0].numpy()).dtype == np.float32
+    finally:
+        torch.set_default_dtype(torch.float32)

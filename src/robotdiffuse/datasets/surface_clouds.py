@@ -46,7 +46,7 @@ def surface_clouds(
     region: only points inside it.
     ordered: sorted by x, then y, then z, for encoders that depend on the order.
     """
-    clouds = torch.zeros(len(scenes), count, 3)
+    clouds = torch.zeros(len(scenes), count, 3, dtype=torch.float32)
     if scenes.kinds.size and count:
         seeds = torch.randint(2**62, (len(scenes),), generator=generator, device=generator.device)
         fill_clouds(

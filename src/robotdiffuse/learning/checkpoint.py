@@ -98,7 +98,8 @@ def _load(name: str, folder: FilePath) -> Any:
         network.load_state_dict(load(data))
     except (RuntimeError, SafetensorError) as error:
         raise InputError(f"{weights} does not fit its description: {str(error)[:200]}") from None
-    return network.requires_grad_(False).eval()
+    # PyTorch's default may be another type
+    return network.float().requires_grad_(False).eval()
 
 
 def load_encoder(folder: str | FilePath) -> Encoder:
