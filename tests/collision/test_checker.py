@@ -402,3 +402,11 @@ def test_nearest_voxels_are_those_of_a_distance_transform(shape, count) -> None:
     away = there - np.moveaxis(np.indices(shape), 0, -1)
     np.testing.assert_array_equal(squares, (away**2).sum(axis=-1))
     np.testing.assert_allclose(np.sqrt(squares), np.asarray(distance_transform_edt(run < 0)), rtol=1e-6)
+
+
+def test_underflow_in_the_arrays_of_a_robot_is_harmless() -> None:
+    """Regression: with `np.seterr(all="raise")`, planning with a held object raised FloatingPointError, for a rounding
+    error of 1e-20 m in the place of the object's bounding sphere."""
+    held = PANDA.attach(rd.Box([0, 0, 0.2], [0.1, 0.1, 0.15]), "panda_hand")
+    with np.errstate(all="raise"):
+        assert CollisionChecker(held, solids()).links

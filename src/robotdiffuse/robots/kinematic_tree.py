@@ -441,7 +441,8 @@ def once_per_robot(build: Callable[[R], T]) -> Callable[[R], T]:
     @wraps(build)
     def cached(robot: R) -> T:
         if name not in robot.__dict__:
-            with loading():
+            # underflow is harmless, but `np.seterr` of the caller may let it raise
+            with loading(), np.errstate(under="ignore"):
                 robot.__dict__[name] = build(robot)
         return robot.__dict__[name]
 
