@@ -10,6 +10,7 @@ import signal
 import time
 from contextlib import ExitStack
 from dataclasses import replace
+from importlib.metadata import PackageNotFoundError
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -380,3 +381,14 @@ def test_a_worker_killed_from_outside_is_one_line_and_the_next_call_goes_on(undi
     monkeypatch.setattr(factory, "on_this_machine", factory_runs.in_this_process)
     generate(MANY, tmp_path)
     assert factory_runs.contents(tmp_path) == undisturbed
+
+
+def test_a_missing_zarr_is_said_before_any_planning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: without the extra `data`, `data generate` ended with a traceback."""
+
+    def version(name: str) -> str:
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(factory, "version", version)
+    refuses(r'zarr, not installed: pip install "robotdiffuse\[data\]"', generate, SETTINGS, tmp_path)
+    assert not list(tmp_path.iterdir())

@@ -8,7 +8,7 @@ import io
 import platform
 import re
 from collections.abc import Callable, Iterable, Mapping
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any
 
@@ -123,13 +123,7 @@ def processor() -> str:
 
 def versions(packages: Iterable[str]) -> dict[str, str]:
     """Versions of packages; `none` for one that is not installed."""
-    numbers = {}
-    for name in packages:
-        try:
-            numbers[name] = version(name)
-        except PackageNotFoundError:
-            numbers[name] = "none"
-    return numbers
+    return {name: next((found.version for found in distributions(name=name)), "none") for name in packages}
 
 
 # Plots

@@ -21,7 +21,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.core.errors import InputError, check_name
+from robotdiffuse.core.errors import InputError, check_name, needs
 from robotdiffuse.core.interrupts import delay_interrupts
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.registry import Entry, Registry
@@ -336,9 +336,9 @@ def _reproducibility_record(settings: GenerationSettings) -> dict[str, str]:
 
 def versions() -> dict[str, str]:
     """Versions of the software that the data depend on."""
-    return {"robotdiffuse": __version__, "python": platform.python_version()} | {
-        name: version(name) for name in PACKAGES
-    }
+    with needs("zarr", "data"):
+        packages = {name: version(name) for name in PACKAGES}
+    return {"robotdiffuse": __version__, "python": platform.python_version()} | packages
 
 
 def manifest_of(settings: GenerationSettings) -> Manifest:
