@@ -173,6 +173,17 @@ def test_a_module_of_the_current_folder_adds_planners_and_shapes(tmp_path: Path,
     assert "module 'no_such_module' cannot be imported: ModuleNotFoundError" in error
 
 
+def test_a_working_folder_that_was_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Said) -> None:
+    """Regression: every command, and `save`, ended with "No such file or directory" without a name."""
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    problem = write_problem(tmp_path)
+    monkeypatch.chdir(folder)
+    folder.rmdir()
+    assert "result.json cannot be written: No such file" in said(2, "plan", problem, "--out", "result.json")
+    assert "module 'added' cannot be imported: FileNotFound" in said(2, "planner", "list", "--import", "added")
+
+
 def test_a_log_says_what_is_compiled(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """Regression: without a terminal, `demo` printed nothing for a minute and a half on a new machine."""
     monkeypatch.setattr(console, "SPINNER_DELAY", 0.0)

@@ -85,8 +85,9 @@ def replaced_folder(target: Path) -> Iterator[Path]:
 
 def check_not_input(out: Path, *inputs: str | None) -> None:
     """Raise InputError if the file or folder `out` is one of the inputs."""
-    if os.path.realpath(out) in map(os.path.realpath, filter(None, inputs)):
-        raise InputError(f"{out} is an input of this command; name another output")
+    with writing(out):  # a relative path in a deleted folder cannot be
+        if os.path.realpath(out) in map(os.path.realpath, filter(None, inputs)):
+            raise InputError(f"{out} is an input of this command; name another output")
 
 
 def check_output(file: str | Path, endings: tuple[str, ...], *inputs: str | None) -> Path:

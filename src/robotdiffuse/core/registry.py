@@ -220,9 +220,9 @@ def import_modules(names: Iterable[str]) -> None:
     Raises InputError for a module that cannot be imported.
     """
     for name in names:
-        if os.getcwd() not in sys.path:
-            sys.path.insert(0, os.getcwd())
         try:
+            if os.getcwd() not in sys.path:
+                sys.path.insert(0, os.getcwd())
             import_module(name)
         except Exception as error:  # an import may raise anything
             raise InputError(f"module {name!r} cannot be imported: {described(error)}") from None
