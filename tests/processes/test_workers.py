@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import util
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -237,3 +238,16 @@ def test_calls_while_the_first_process_starts_wait_for_it() -> None:
         time.sleep(0.1)
         assert [workers.submit(abs, -i) for i in range(3)][2].result(300) == 2
         starting.join()
+
+
+def test_a_process_that_cannot_start_is_said(worker: Worker, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: with too many processes, commands said that their output could not be written; in a worker of
+    multiprocessing.Pool, results said AssertionError."""
+    for error in (BlockingIOError(11, "Resource temporarily unavailable"), AssertionError("daemonic")):
+        start = Mock(side_effect=error)
+        monkeypatch.setattr("multiprocessing.context.SpawnProcess.start", start)
+        with Workers(1) as pool:
+            refuses(r"could not be started: .*(unavailable|daemonic)", list, pool.each(os.getpid, [()]))
+        start.assert_called_once()
+    monkeypatch.undo()
+    assert worker.call(os.getpid) != os.getpid()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.cli.arguments import Namespace
+from robotdiffuse.cli.arguments import Namespace, chosen
 from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.interrupts import exit_on_interrupt
 from robotdiffuse.core.tables import Column, Table, show
@@ -64,16 +64,8 @@ def run_add(arguments: Namespace) -> None:
 
         report = add_robot(
             arguments.urdf,
-            name=arguments.name,
-            base=arguments.base,
-            tip=arguments.tip,
+            **chosen(arguments, ("name", "base", "tip", "limits", "out", "license", "seed", "group", "srdf")),
             locked=dict(arguments.lock),
-            limits=arguments.limits,
-            out=arguments.out,
-            license=arguments.license or "see the URDF",
-            seed=arguments.seed,
-            group=arguments.group,
-            srdf=arguments.srdf,
             allow=[tuple(pair) for pair in arguments.allow],
             packages=dict(arguments.package),
             progress=progress,

@@ -65,7 +65,8 @@ class OverrunError(EndedError):
 def check_not_importing() -> None:
     """End this process if it is a worker that still imports the main script, and the script starts workers on
     import because it lacks GUARD. The process that the user started reports it."""
-    if sys.modules["__main__"] is not sys.modules.get("__mp_main__", sys.modules["__main__"]):
+    main = sys.modules["__main__"]
+    if main is not sys.modules.get("__mp_main__", main):
         sys.exit(1)
 
 
@@ -120,8 +121,6 @@ class Worker:
 
         Raises NotStartedError if it cannot start, EndedError if it ends while it prepares or is closed.
         """
-        if self._closed:
-            raise EndedError("closed")
         if self._running is None and self._start() is True:
             self.end(0.0)
             self._start()
@@ -132,9 +131,12 @@ class Worker:
         process = _SPAWN.Process(target=_main, args=(child_end,))
         _started.add(self)
         with delay_interrupts(), self._starting, block_interrupts_in_children():
-            if self._closed:  # meanwhile, by another thread
+            if self._closed:  # perhaps just now, by another thread
                 raise EndedError("closed")
-            process.start()
+            try:
+                process.start()
+            except (AssertionError, OSError) as error:  # in a daemonic process; too many processes
+                raise NotStartedError(f"a worker process could not be started: {error}") from None
             child_end.close()
             self._running = (process, connection)
             self._number = 0
