@@ -99,7 +99,8 @@ def test_depth_files(tmp_path: Path) -> None:
     # integers of 65535 are no returns
     Image.fromarray(np.array([[1000, 65535]], np.uint16)).save(tmp_path / "a.png")
     np.save(tmp_path / "a.npy", np.array([[1000, 65535]], np.uint16))
-    for name in ("a.png", "a.npy"):
+    np.save(tmp_path / "long.npy", np.array([[1000, 2**32 - 1]], np.uint32))
+    for name in ("a.png", "a.npy", "long.npy"):
         assert read_depth(tmp_path / name).tolist() == [[1.0, 0.0]]
     refuses("view.scale is -1.0; it must be a number", read_depth, tmp_path / "a.png", -1.0)
 

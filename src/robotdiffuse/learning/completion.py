@@ -30,6 +30,7 @@ from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 from robotdiffuse.perception.observed_volume import ObservedVolume, observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.seen_points import near_scene
+from robotdiffuse.perception.unknown_space import LOST_PROBABILITY, lost_regions
 from robotdiffuse.perception.voxel_grid import COARSE, FINE, SHAPE
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.families.family import Range, base_spheres
@@ -235,10 +236,14 @@ def predict(volume: ObservedVolume, network: Completion | None = None) -> Float3
     """The probability that each voxel of 2 cm holds an obstacle.
 
     It is 0 in voxels that were seen free. It is also 0 farther than 1 m from a Panda's shoulder, since
-    training did not cover these voxels. The lower corner of the grid is `voxel_grid.LOW`, in the base frame.
+    training did not cover these voxels. In lost regions, which the network mistakes for free space, it is at
+    least LOST_PROBABILITY. The lower corner of the grid is `voxel_grid.LOW`, in the base frame.
     network: None: the network that comes with the package.
     """
-    return (network or exported_completion())(*pack(volume))
+    return np.maximum(
+        (network or exported_completion())(*pack(volume)),
+        np.float32(LOST_PROBABILITY) * lost_regions(volume),
+    )
 
 
 def exported_completion(folder: str | FilePath | None = None) -> Completion:

@@ -35,7 +35,7 @@ from robotdiffuse.core.types import Configuration, Points, Pose, Value, frozen_d
 from robotdiffuse.scenes.shapes import PointCloud
 
 INTEGER_NO_RETURN = 65535
-"""Integer depths of this value, the largest of 16 bits, mean "no return"."""
+"""Integer depths of this value, the largest of 16 bits, mean "no return", in images of any type."""
 MIN_FOCAL_LENGTH = 1e-3
 """Minimum focal length [pixels]: smaller values underflow in float32, or are meaningless."""
 NEAREST = 0.05

@@ -55,8 +55,9 @@ INTEGER_SCALE = 0.001
 def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "h w"]:
     """A depth image [m] from a 16 bit .png, a .npy, a .npz (its array `depth`, or its only array), or a .exr.
 
-    scale: meters per unit; None: 0.001 for integers, 1 for floating-point numbers. Integers of 65535 count as
-    0, "no return". Raises InputError for a file that is missing or is not a depth image.
+    scale: meters per unit; None: 0.001 for integers, 1 for floating-point numbers. Integers of 65535, and
+    the largest of their type, count as 0, "no return". Raises InputError for a file that is missing or is not
+    a depth image.
     """
     file = Path(file)
     read = _READERS[known_ending(file, "depth image", _READERS)]
@@ -74,8 +75,9 @@ def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "
     integers = image.dtype.kind in "ui"
     if scale is None:
         scale = INTEGER_SCALE if integers else 1.0
+    no_return = (INTEGER_NO_RETURN, np.iinfo(image.dtype).max) if integers else ()
     depth = image.astype(np.float64)
-    return np.where(integers & (depth == INTEGER_NO_RETURN), 0.0, depth * positive("view", "scale", scale))
+    return np.where(np.isin(image, no_return), 0.0, depth * positive("view", "scale", scale))
 
 
 def _read_png(file: Path) -> ndarray:

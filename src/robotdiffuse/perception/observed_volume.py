@@ -15,7 +15,13 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Configuration
-from robotdiffuse.perception.depth_filter import empty_regions, filtered, grown_for_errors, open_depth
+from robotdiffuse.perception.depth_filter import (
+    empty_regions,
+    filtered,
+    grown_for_errors,
+    measured_share,
+    open_depth,
+)
 from robotdiffuse.perception.depth_view import NEAREST, DepthView
 from robotdiffuse.perception.ray_caster import balls, in_camera, rectangle, render_depth
 from robotdiffuse.perception.voxel_grid import COARSE, SHAPE, VoxelGrid
@@ -130,8 +136,6 @@ def usable_image(
     spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
     spheres[:, 3] += margin
     spheres = spheres.astype(np.float32)
-    if view.cloud is not None:
-        return depth, spheres
     intrinsics = np.array(view.intrinsics, np.float32)
     arm_pixels = _arm_pixels(depth, intrinsics, spheres)
     empty = empty_regions(view.depth, view.range, arm_pixels)
@@ -551,7 +555,8 @@ def merged(volumes: Sequence[ObservedVolume]) -> ObservedVolume:
 
 
 def observed_by(view: DepthView, robot: Robot, start: Configuration) -> ObservedVolume:
-    """The volume observed by one view."""
+    """The volume observed by one view. Without a surface in the image, the camera may be covered or broken:
+    all voxels are unknown."""
     q = start if view.configuration is None else view.configuration
     if len(q) != robot.dof:
         raise InputError(
@@ -561,7 +566,8 @@ def observed_by(view: DepthView, robot: Robot, start: Configuration) -> Observed
     state, behind, counts = carve_view(view, robot, q, COARSE)
     occupied = counts > 0
     behind[(state != BEHIND) | occupied] = 0.0
-    free, shadow, lost = ((state == kind) & ~occupied for kind in (FREE, SHADOW, LOST))
+    measured = measured_share(view) > 0
+    free, shadow, lost = ((state == kind) & ~occupied & measured for kind in (FREE, SHADOW, LOST))
     return ObservedVolume(occupied, free, shadow, state == OUT, behind, lost)
 
 

@@ -266,15 +266,13 @@ def seen_points(views: Sequence[DepthView], robot: Robot, start: Configuration) 
         sums = np.zeros((capacity, 4), np.float32)
         count = 0
         for view in views:
-            spheres = robot.placed_spheres(start if view.configuration is None else view.configuration)
-            depth = filtered(view).depth
-            spheres = grown_for_errors(spheres, view)
-            spheres = (spheres + np.array([0, 0, 0, ARM_DISTANCE])).astype(np.float32)
+            arm = robot.placed_spheres(start if view.configuration is None else view.configuration)
+            spheres = grown_for_errors(arm + np.array([0, 0, 0, ARM_DISTANCE]), view).astype(np.float32)
             if view.cloud is not None:
                 points = for_kernels(view.cloud.T, np.float32)
             else:
                 intrinsics = tuple(map(np.float32, view.intrinsics))
-                points = image_points(depth, intrinsics, view.T_base_camera.astype(np.float32))
+                points = image_points(filtered(view).depth, intrinsics, view.T_base_camera.astype(np.float32))
             reach = np.float32(reach_bound(robot) + REACH_MARGIN)
             count = gather(points, reach, spheres, np.float32(CELL), keys, row_of, sums, count)
             if count < 0:
@@ -352,6 +350,7 @@ def point_shapes(
             distance = (JOINED if radius > POINT_RADIUS else 1.0) * radius + MIN_POINT_RADIUS
             part = remaining & (distances >= distance) if radius > MIN_POINT_RADIUS else remaining
             remaining = remaining & ~part
-            shapes += [SeenPoints(alike[part], radius, name=name)] if part.any() else []
+            if part.any():
+                shapes.append(SeenPoints(alike[part], radius, name=name))
             name = "seen_at_ends"
     return tuple(shapes)

@@ -110,14 +110,20 @@ Box = tuple[tuple[float, ...], tuple[float, ...]]
 
 
 LOST_WIDTH = 3
-"""Smallest width [voxels of 4 cm] of regions without a return that lower the confidence. The images that the
-network was trained with had smaller ones."""
+"""Smallest width [voxels of 4 cm] of lost regions. The images that the network was trained with had smaller
+ones, so it mistakes large ones for free space."""
+LOST_DEPTH = 1.0
+"""Space that is farther behind a surface is lost too: a hand before the lens hides everything [m]."""
+LOST_PROBABILITY = 0.15
+"""Smallest probability that a voxel of a lost region is occupied. Behind obstacles that gave no return it was
+0.18 on average, behind a hand before the lens 0.03 to 0.07."""
 
 
 def lost_regions(volume: ObservedVolume) -> Voxels:
-    """The fine voxels on rays without a return, in regions at least LOST_WIDTH wide."""
-    lost = volume.lost
-    return refined(wide_regions(lost, LOST_WIDTH) if lost.any() else lost)
+    """The fine voxels on rays without a return, or far behind a surface, in regions at least LOST_WIDTH
+    wide."""
+    lost = volume.lost | (volume.behind > LOST_DEPTH)
+    return refined(wide_regions(lost, LOST_WIDTH))
 
 
 class UnknownSpace:
@@ -220,12 +226,13 @@ def probability_free(risk: float, curve: tuple[float, float]) -> float:
 def confidence(assumption: str, crossed: CrossedSpace) -> float:
     """The probability that a motion under an assumption is free in the true scene.
 
-    It follows from the risk, or, without a prediction, it is the rate of the assumption in RATES. It is at
-    most UNSEEN_CONFIDENCE if views saw hardly any of the space that the motion passes through. It is reduced
-    in proportion to the share of this space on rays without a return, even if the network predicts that this
-    space is free.
+    It follows from the risk. Without a prediction, it is the rate of the assumption in RATES, reduced in
+    proportion to the share of lost regions in the space that the motion passes through. It is at most
+    UNSEEN_CONFIDENCE if views saw hardly any of this space.
     """
-    stated = RATES[assumption] if crossed.risk is None else probability_free(crossed.risk, ONE_VIEW)
-    if crossed.unseen_share > MAX_UNSEEN_SHARE:
-        stated = min(stated, UNSEEN_CONFIDENCE)
-    return stated * (1 - crossed.lost_share)
+    stated = (
+        RATES[assumption] * (1 - crossed.lost_share)
+        if crossed.risk is None
+        else probability_free(crossed.risk, ONE_VIEW)
+    )
+    return min(stated, UNSEEN_CONFIDENCE) if crossed.unseen_share > MAX_UNSEEN_SHARE else stated

@@ -523,19 +523,16 @@ class Explorer:
         self, motion: PlanResult, predicted: Probabilities | None, to_goal: bool = True
     ) -> PlanResult:
         """The motion with the confidence that follows from the summed probability of the voxels that it
-        sweeps and from its share of space without returns; None if the map holds no measurement. Without a
-        path or a prediction, the motion is returned unchanged.
+        sweeps; None if the map holds no measurement. Without a path or a prediction, the motion is returned
+        unchanged.
 
         The arm counts as free of collision at the start of a motion and at the goal, but not at a viewpoint.
         """
         if motion.path is None or predicted is None:
             return motion
         ends = motion.path.positions[[0, -1] if to_goal else [0]]
-        crossed = self._unknown(ends, predicted).crossed(motion.path)
-        swept = crossed.risk
-        stated = None
-        if swept is not None and not self.map.is_blind:
-            stated = probability_free(swept, EXPLORED) * (1 - crossed.lost_share)
+        swept = self._unknown(ends, predicted).crossed(motion.path).risk
+        stated = None if swept is None or self.map.is_blind else probability_free(swept, EXPLORED)
         return replace(motion, swept_probability=swept, confidence=stated)
 
     def _unknown(self, ends: Iterable[Configuration], predicted: Probabilities | None) -> UnknownSpace:

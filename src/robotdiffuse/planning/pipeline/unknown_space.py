@@ -119,17 +119,15 @@ def plan_with_unknown_space(
             " the depths, with their scale, not in meters?"
         )
         return _with_notes(context, context.fail(Status.NO_PATH, why))
-    for i, wrong in enumerate(cameras):
+    for i, (wrong, seen, share) in enumerate(zip(cameras, volumes, shares, strict=False)):
         if wrong:
             context.note(f"check the camera of views[{i}]: {wrong}")
-    for i, seen in enumerate(volumes):
         if seen.unknown.all():
             context.note(f"views[{i}] shows nothing of the space around the arm: check its T_base_camera")
-    for i, share in enumerate(shares):
         if share < NOTED_SHARE:
             remedy = "; if the sensor gives 0 where nothing is in range, state the view's range"
             context.note(
-                f"views[{i}]: {100 * (1 - share):.0f} % of the pixels measure nothing, which lowers the"
+                f"views[{i}]: {100 * (1 - share):.0f} % of the pixels measure nothing, which may lower the"
                 f" confidence{remedy if problem.views[i].cloud is None else ''}"
             )
     attempts = _Attempts(planner, context, unknown, UNSEEN_CONFIDENCE if any(cameras) else 1.0)
@@ -283,10 +281,10 @@ class _Attempts:
         while len(motions) < MAX_FIRST_MOTIONS:
             quick = replace(request, until=FIRST, seed=request.seed + len(motions)) if predicted else request
             result = self._attempt(problem, assumption, end, quick)
-            if not result.solved and not motions:
-                return result
             if not result.solved:
-                break
+                if motions:
+                    break
+                return result
             motions.append(result)
             lowest_risk = min(motion.swept_probability or 0.0 for motion in motions)
             acceptable = ACCEPTABLE_RISK if len(motions) >= MIN_FIRST_MOTIONS else NEGLIGIBLE_RISK
@@ -294,7 +292,8 @@ class _Attempts:
                 break
         if predicted and request.until != FIRST and self.context.elapsed < end:
             result = self._attempt(problem, assumption, end, request)
-            motions += [result] if result.solved else []
+            if result.solved:
+                motions.append(result)
         min_confidence = max(motion.confidence or 0.0 for motion in motions) - CONFIDENCE_TOLERANCE
         best = [motion for motion in motions if (motion.confidence or 0.0) >= min_confidence]
         chosen = min(best, key=lambda motion: motion.path_length)
