@@ -198,9 +198,8 @@ class Arm(NamedTuple):
     def name(self) -> str:
         """The common prefix of the names of the arm's own joints; the name of the tip if there is no common
         prefix."""
-        joints = self.joints[-self.own_joints :]
-        common = commonprefix(joints).rstrip(SUFFIX_CHARACTERS)  # noqa: RUF071  (characters, not folders)
-        return common.removesuffix("joint").rstrip("_-/ ") or self.tip
+        common = commonprefix(self.joints[-self.own_joints :])  # noqa: RUF071  (characters, not folders)
+        return common.rstrip(SUFFIX_CHARACTERS).removesuffix("joint").rstrip("_-/ ") or self.tip
 
 
 class JointTree:

@@ -104,6 +104,8 @@ class UrdfTree:
     """Joints without a velocity limit."""
     unranged: set[str] = field(default_factory=set)
     """Joints without limits of position, such as wheels; they can be held at 0, but not planned."""
+    text: bytes = field(init=False)
+    """The URDF, also of a xacro file or a MuJoCo model."""
     _surfaces: dict[str, tuple[Surface, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -628,7 +630,7 @@ def _attributes(element: ET.Element, tag: str) -> dict[str, str]:
 
 
 # FIELDS: MoveIt's fields of joint_limits.yaml, and those of `Joint`. FACTORS: MoveIt's fields that are
-# ignored with a note. FLAG: prefix of fields that switch limits off, such as has_jerk_limits and others.
+# ignored with a note.
 FIELDS = {
     "min_position": "lower",
     "max_position": "upper",
@@ -637,7 +639,6 @@ FIELDS = {
     "max_jerk": "jerk",
 }
 FACTORS = ("default_velocity_scaling_factor", "default_acceleration_scaling_factor")
-FLAG = "has_"
 
 
 def read_limits(file: str | Path) -> tuple[dict[str, dict[str, float]], tuple[str, ...]]:
@@ -687,7 +688,7 @@ def _fields(file: str, joint: str, entry: object) -> dict[str, float]:
         raise InputError(f"{file}: joint_limits of {joint} is {shown(entry)}; it must be a mapping")
     fields: dict[str, float] = {}
     for key, value in entry.items():
-        if str(key).startswith(FLAG):
+        if str(key).startswith("has_"):  # MoveIt's flags, such as has_jerk_limits
             continue
         check_name(f"field of {joint} in {file}", key, FIELDS)
         kind = "position" if key.endswith("position") else key.removeprefix("max_")
