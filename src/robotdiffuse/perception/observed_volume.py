@@ -33,7 +33,7 @@ FREE = 1  # observed as entirely free
 BEHIND = 2  # behind a surface
 SHADOW = 3  # behind the arm
 OUT = 4  # outside the image
-LOST = 5  # on a ray without a return; something may be in range
+LOST = 5  # on a ray without a return, so that something may be in range, or covered at the lens
 # Depths of pixels without a return. A depth of -d means that nothing is nearer than d to the camera.
 NO_RETURN = np.float32(0.0)
 EMPTY = np.float32(-1e-6)
@@ -54,6 +54,8 @@ FLYING_PIXEL_STEP = np.float32(0.03)
 """A flying pixel is nearer than one neighbor and farther than the opposite neighbor by at least this [m], and
 by at least FLYING_PIXEL_WIDTHS widths of a pixel at its distance."""
 FLYING_PIXEL_WIDTHS = np.float32(4.0)
+LENS_DISTANCE = np.float32(0.2)
+"""A surface nearer than this may cover the lens, as a hand does; what is behind it is LOST [m]."""
 BLOCK = 4
 """Edge of the blocks of voxels that are first tested as a whole [voxels]."""
 PIXEL_SLACK = np.float32(0.01)
@@ -461,7 +463,7 @@ def _carve_block(
                 state[i, j, k] = HIDDEN
                 if arm[row, column]:
                     state[i, j, k] = SHADOW
-                elif center_depth <= -_NEAREST:
+                elif center_depth <= -_NEAREST or _ZERO < front < LENS_DISTANCE:
                     state[i, j, k] = LOST
                 elif front < z:
                     state[i, j, k] = BEHIND
@@ -513,8 +515,8 @@ class ObservedVolume:
     """How far the voxel is behind an observed surface, the minimum over all views [m]; 0 if it is behind
     none, or observed."""
     lost: Bool[ndarray, "56 56 32"]
-    """The voxel is unknown and behind no surface, and in some view its ray has no return, so that something
-    may be in range."""
+    """The voxel is unknown and behind no other surface, and in some view its ray has no return, so that
+    something may be in range, or meets a surface nearer than LENS_DISTANCE."""
 
     @cached_property
     def unknown(self) -> Bool[ndarray, "56 56 32"]:

@@ -112,18 +112,14 @@ Box = tuple[tuple[float, ...], tuple[float, ...]]
 LOST_WIDTH = 3
 """Smallest width [voxels of 4 cm] of lost regions. The images that the network was trained with had smaller
 ones, so it mistakes large ones for free space."""
-LOST_DEPTH = 1.0
-"""Space that is farther behind a surface is lost too: a hand before the lens hides everything [m]."""
 LOST_PROBABILITY = 0.15
 """Smallest probability that a voxel of a lost region is occupied. Behind obstacles that gave no return it was
 0.18 on average, behind a hand before the lens 0.03 to 0.07."""
 
 
 def lost_regions(volume: ObservedVolume) -> Voxels:
-    """The fine voxels on rays without a return, or far behind a surface, in regions at least LOST_WIDTH
-    wide."""
-    lost = volume.lost | (volume.behind > LOST_DEPTH)
-    return refined(wide_regions(lost, LOST_WIDTH))
+    """The fine voxels that were lost in regions at least LOST_WIDTH wide."""
+    return refined(wide_regions(volume.lost, LOST_WIDTH))
 
 
 class UnknownSpace:
