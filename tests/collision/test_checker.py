@@ -14,7 +14,6 @@ from helpers import sphere_oracles as oracles
 from helpers.box_arm import box_arm
 from helpers.panda import PANDA
 from helpers.refusals import refuses
-from helpers.sphere_oracles import solids
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients, packed_link_clearances
 from robotdiffuse.collision.exact_meshes import ExactCollision
@@ -234,17 +233,13 @@ LIMIT = 0.4
 MARGIN = 0.1
 
 
-def configurations(*shape: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(PANDA.lower, PANDA.upper, (*shape, PANDA.dof)).astype(np.float32)
-
-
 def test_inputs_are_the_same_in_training_and_planning() -> None:
     """In scenes of different size in one batch, whether or not gradients are computed too."""
     rng = np.random.default_rng(1)
     scenes = [family.scene(rng) for family in (ROP, ROP_DENSE, ROP_DENSE)]
     scenes.append(rd.Scene(scenes[0].shapes[:1]))
     packed = PackedScenes.pack(scenes, 12, floor=True)
-    q = configurations(len(packed), 60)
+    q = oracles.rows(PANDA, 60 * len(packed)).reshape(len(packed), 60, PANDA.dof).astype(np.float32)
     config = motion_model.MotionModelSettings(clearance_gradients=True)
     given = compile_robot(PANDA), packed, q, motion_model.MAX_CLEARANCE
     clearances, gradients = packed_clearances_and_gradients(*given, motion_model.GRADIENT_MARGIN)
@@ -259,8 +254,8 @@ def test_inputs_are_the_same_in_training_and_planning() -> None:
 
 def test_gradients_are_those_of_the_clearances() -> None:
     """Compares with automatic differentiation of the signed distance that training losses use."""
-    q = configurations(400).astype(np.float64)
-    scene = rd.Scene(solids().shapes[:2])
+    q = oracles.rows(PANDA, 400)
+    scene = rd.Scene(oracles.solids().shapes[:2])
     checker = CollisionChecker(PANDA, scene)
     packed = PackedScenes.pack([scene] * len(q), 2)
     distance = ArmDistance(ForwardKinematics(PANDA, torch.float64))
@@ -285,7 +280,7 @@ def test_gradients_of_a_cloud_are_those_of_what_it_covers() -> None:
     surface = np.array([0.5, 0.1, 0.5]) + 0.195 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     solid = CollisionChecker(PANDA, rd.Scene([rd.Sphere((0.5, 0.1, 0.5), 0.2)]))
     cloud = CollisionChecker(PANDA, rd.Scene([rd.PointCloud(surface, 0.005)]))
-    q = configurations(600).astype(np.float64)
+    q = oracles.rows(PANDA, 600)
     right, found = (checker.clearances_and_gradients(q, LIMIT, MARGIN) for checker in (solid, cloud))
     # deep inside, the surface's points push elsewhere than the solid does
     touched = (right[0].min(axis=1) > 0.0) & (right[0].min(axis=1) < 0.09)
@@ -405,8 +400,7 @@ def test_nearest_voxels_are_those_of_a_distance_transform(shape, count) -> None:
 
 
 def test_underflow_in_the_arrays_of_a_robot_is_harmless() -> None:
-    """Regression: with `np.seterr(all="raise")`, planning with a held object raised FloatingPointError, for a rounding
-    error of 1e-20 m in the place of the object's bounding sphere."""
+    """Regression: with `np.seterr(all="raise")`, a rounding error of 1e-20 m in the place of a held object was an error."""
     held = PANDA.attach(rd.Box([0, 0, 0.2], [0.1, 0.1, 0.15]), "panda_hand")
     with np.errstate(all="raise"):
-        assert CollisionChecker(held, solids()).links
+        assert CollisionChecker(held, oracles.solids()).links

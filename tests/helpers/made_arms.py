@@ -50,6 +50,7 @@ def row(prefix: str, count: int) -> list[str]:
 
 
 def written(folder: Path, *parts: str, file: str = "made.urdf", name: str = "made") -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
     (folder / file).write_text(robot(*parts, name=name), encoding="utf-8")
     return folder / file
 

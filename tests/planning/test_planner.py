@@ -1,5 +1,4 @@
-"""Every planner: solved means verified, anything else has a reason; each kind of request is fulfilled or refused; seeds;
-many problems at a time; continuous joints, of which values that differ by a whole turn are equal."""
+"""Every planner: solved means verified, all else has a reason; requests; seeds; many problems; continuous joints."""
 
 import inspect
 import re

@@ -147,9 +147,8 @@ for thing in things:
 
 
 def test_wrong_names_and_motions_are_refused_in_one_line() -> None:
-    """Regression: lists and arrays in place of names were a TypeError or a ValueError; a box moved by twice the identity stayed
-    as it was. A process without this suite's type checks makes these calls."""
-    python(WRONG_TYPES)
+    """Regression: lists in place of names were a TypeError or a ValueError; a box moved by twice the identity stayed."""
+    python(WRONG_TYPES)  # without this suite's type checks
 
 
 def test_what_a_scene_cannot_hold_is_not_lost() -> None:

@@ -11,18 +11,10 @@ from numpy import ndarray
 import robotdiffuse as rd
 from robotdiffuse.core.types import FIRST
 from robotdiffuse.learning.completion import predict
+from robotdiffuse.perception import unknown_space as assumptions
 from robotdiffuse.perception.depth_view import SeenPoints
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
-from robotdiffuse.perception.unknown_space import (
-    CARVING_MARGIN,
-    LOST_PROBABILITY,
-    PADDINGS,
-    RATES,
-    OccupiedVoxels,
-    Padded,
-    lost_regions,
-)
 from robotdiffuse.perception.voxel_grid import COARSE, FINE, heaviest_part
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.pipeline import unknown_space
@@ -106,8 +98,8 @@ def test_occupied_crosses_nothing_unknown_but_at_the_ends(planner: Planner) -> N
     near = START + 0.15 * (GOAL - START)
     problem = replace(partial("occupied", *views), goal=near)
     result = planner.plan(problem, time_limit=20.0, until=FIRST)
-    assert result.assumption == "unknown is occupied" and result.confidence == RATES["unknown is occupied"]
-    filled = COARSE.filled(PANDA, (START, near), CARVING_MARGIN + COARSE.edge / 2)
+    assert result.assumption == "unknown is occupied" and result.confidence == assumptions.RATES["unknown is occupied"]
+    filled = COARSE.filled(PANDA, (START, near), assumptions.CARVING_MARGIN + COARSE.edge / 2)
     unknown = observe(problem.views, PANDA, START).unknown & ~filled
     assert unknown.any() and not (COARSE.swept(PANDA, result.path) & unknown).any()
 
@@ -127,13 +119,14 @@ def test_assumptions_are_carved_free_at_the_ends() -> None:
     solid = np.ones(FINE.shape, np.bool_)
     volume = observe([taken(DEEP)], PANDA, START)
     chain = [one for p in ("padded", "occupied") for one in unknown_space.assumptions_of(partial(p), volume, None)]
-    assert [assumption.padding for assumption in chain if isinstance(assumption, Padded)] == list(PADDINGS)
-    for assumption in (*chain, OccupiedVoxels("all", solid, PANDA, rd.Scene())):
+    assert [one.padding for one in chain if isinstance(one, assumptions.Padded)] == list(assumptions.PADDINGS)
+    everywhere = assumptions.OccupiedVoxels("all", solid, PANDA, rd.Scene())
+    for assumption in (*chain, everywhere):
         cloud = assumption.obstacles(ends)
         away = np.linalg.norm(cloud.points[:, None] - ends[None, :, :3], axis=2) - ends[:, 3]
         assert len(cloud.points) and away.min() > cloud.point_radius
-        assert assumption.touched(ends).any() or isinstance(assumption, Padded)
-    assert len(OccupiedVoxels("all", solid, PANDA, rd.Scene()).obstacles(ends[:1]).points) < 0.15 * solid.size
+        assert assumption.touched(ends).any() or isinstance(assumption, assumptions.Padded)
+    assert len(everywhere.obstacles(ends[:1]).points) < 0.15 * solid.size
 
 
 def test_a_view_of_no_space_around_the_arm_is_noted(planner: Planner) -> None:
@@ -181,10 +174,8 @@ def test_confidence_falls_with_what_rays_do_not_tell(planner: Planner) -> None:
     view = taken(rd.Scene([FLOOR]))
     lost = view.depth.copy()
     lost[:, :100] = 0.0
-    whole, half = (
-        unknown_space.plan_with_unknown_space(planner, partial("optimistic", one), REQUEST)
-        for one in (view, replace(view, depth=lost, range=4.0))
-    )
+    views = view, replace(view, depth=lost, range=4.0)
+    whole, half = (unknown_space.plan_with_unknown_space(planner, partial("optimistic", one), REQUEST) for one in views)
     assert whole.confidence is not None and half.confidence is not None
     assert half.confidence < 0.6 * whole.confidence
     assert any("of the pixels measure nothing" in note for note in half.notes)
@@ -196,12 +187,11 @@ def test_confidence_falls_with_what_rays_do_not_tell(planner: Planner) -> None:
 
 @pytest.mark.parametrize("depth", [0.0, 0.15])
 def test_half_an_image_that_measured_nothing_is_not_predicted_free(depth: float) -> None:
-    """Regression: behind a hand before the lens, and with half of an image lost, confidences were up to 0.93, but 12 of 16
-    motions hit an obstacle."""
+    """Regression: with half of an image lost or behind a hand, confidences were up to 0.93, but 12 of 16 motions collided."""
     view = taken(DEEP)
     hidden = view.depth.copy()
     hidden[:, :80] = depth
     volume = observe([replace(view, depth=hidden, range=4.0)], PANDA, START)
-    lost = lost_regions(volume)
-    assert lost.mean() > 0.2 > lost_regions(observe([view], PANDA, START)).mean()
-    assert (predict(volume)[lost] >= LOST_PROBABILITY).all()
+    lost = assumptions.lost_regions(volume)
+    assert lost.mean() > 0.2 > assumptions.lost_regions(observe([view], PANDA, START)).mean()
+    assert (predict(volume)[lost] >= assumptions.LOST_PROBABILITY).all()

@@ -1,5 +1,4 @@
-"""Allowed collisions on arms made by hand: pairs of links that never, always or by default collide; a table over the
-joints between a fork and a flange that rotates in it, closer than spheres can resolve."""
+"""Allowed collisions of arms made by hand; a table over the joints of a flange in a fork, closer than spheres resolve."""
 
 from dataclasses import replace
 from functools import cache
@@ -15,37 +14,35 @@ from helpers.quick_preparation import coarse_grids
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.transforms import transform
+from robotdiffuse.robots.fitting import self_collisions
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, Surface, convex_hull
 from robotdiffuse.robots.fitting.covering_spheres import cover
 from robotdiffuse.robots.fitting.preparation import AddReport, PreparationSettings, Prepared, prepare
 from robotdiffuse.robots.fitting.sampled_links import Links, joint_table
-from robotdiffuse.robots.fitting.self_collisions import (
-    FalseCollisions,
-    PairReport,
-    SamplingSettings,
-    find_allowed_collisions,
-    measure_false_collisions,
-)
 from robotdiffuse.robots.fitting.sphere_fitting import SphereSettings
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import ConvexMesh, LinkPairTable, Robot
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.scenes.scene import Scene
 
-QUICK = SamplingSettings(samples=1500)
+QUICK = self_collisions.SamplingSettings(samples=1500)
 
 
 def limited(robot: Robot, bound: float) -> Robot:
     return replace(robot, joints=tuple(replace(j, lower=-bound, upper=bound) for j in robot.joints))
 
 
+def found_pairs(robot: Robot, seed: int = 0, settings: self_collisions.SamplingSettings = QUICK) -> dict:
+    found = self_collisions.find_allowed_collisions(robot, settings, np.random.default_rng(seed))
+    return {report.links: report for report in found}
+
+
 def test_rare_collision_is_found_by_descent() -> None:
     """The links collide only in a hundredth of the range of both joints, which 100 samples miss."""
     robot = limited(box_arm(), 2.2)
-    few = SamplingSettings(samples=100)
+    few = self_collisions.SamplingSettings(samples=100)
     for seed in range(3):
-        (pair,) = (r for r in find_allowed_collisions(robot, few, np.random.default_rng(seed)) if r.links == ("l1", "l3"))
-        assert pair.reason == "checked"
+        assert found_pairs(robot, seed, few)["l1", "l3"].reason == "checked"
 
 
 def overlapping(lower: float, own: bool = True) -> Robot:
@@ -100,8 +97,7 @@ def tucked(bend: float) -> Robot:
 
 
 def thick(bound: float) -> Robot:
-    """An arm whose first and last link collide in half of a joint's range, as the meshes of Baxter's forearm and wrist do,
-    although the real links do not; the range is evidence of a stop only below a full turn."""
+    """First and last link collide in half of a joint's range, as Baxter's meshes do: a stop only below a full turn."""
     wide = limited(box_arm(), bound)
     joints = tuple(replace(j, lower=-0.2, upper=0.2) if j.name == wide.joint_names[2] else j for j in wide.joints)
     (box,) = wide.meshes["l1"]
@@ -138,20 +134,18 @@ FOUND = {
 @pytest.mark.parametrize("case", FOUND)
 def test_pairs_that_need_no_check_are_found(case: str) -> None:
     make, pair, found = FOUND[case]
-    reports = find_allowed_collisions(make(), QUICK, np.random.default_rng(0))
-    assert {report.links: report.reason for report in reports}[pair] == found
+    assert found_pairs(make())[pair].reason == found
 
 
 @pytest.mark.parametrize("reason", ["default", "limits", "pose"])
 def test_pairs_that_meet_and_are_not_checked_are_told(reason: str) -> None:
-    pairs = (PairReport(("l1", "l3"), reason, 0.27), PairReport(("l1", "l2"), "adjacent", 1.0))
-    (warning,) = AddReport(box_arm(), Path(), (), pairs, FalseCollisions(0.7, 0.0, 0.0, ()), 0.0, 0).warnings
+    pairs = (self_collisions.PairReport(("l1", "l3"), reason, 0.27), self_collisions.PairReport(("l1", "l2"), "adjacent", 1.0))
+    (warning,) = AddReport(box_arm(), Path(), (), pairs, self_collisions.FalseCollisions(0.7, 0.0, 0.0, ()), 0.0, 0).warnings
     assert "l1 against l3 is not checked" in warning and "27.0%" in warning
 
 
 def test_share_of_collisions_by_hand() -> None:
-    robot = with_middle(overlapping(0.02))
-    (pair,) = (r for r in find_allowed_collisions(robot, QUICK, np.random.default_rng(0)) if r.links == ("a", "c"))
+    pair = found_pairs(with_middle(overlapping(0.02)))["a", "c"]
     # the cubes overlap up to joint 2 = 0.05, of 0.02 to 1; the spheres, which do not count, up to 0.1234
     assert pair.colliding == pytest.approx(0.03 / 0.98, abs=0.015)
 
@@ -165,7 +159,7 @@ def test_false_collisions_of_parts_after_true_ones_are_counted() -> None:
     slide = Joint("slide", "prismatic", "plates", "box", np.eye(4), np.array([1.0, 0, 0]), -0.1, 0.4)
     spheres = {link: cover(part) for link, (part,) in parts.items()}
     robot = Robot("slider", "plates", "box", (slide,), spheres, parts)
-    measured = measure_false_collisions(robot, surfaces, 2000, np.random.default_rng(0))
+    measured = self_collisions.measure_false_collisions(robot, surfaces, 2000, np.random.default_rng(0))
     # of 0.5 m, the box is in a plate for 0.12 m and between them, without touching one, for 0.24 m
     assert measured.free == pytest.approx(0.76, abs=0.05)
     assert measured.by_parts == pytest.approx(0.24 / 0.38, abs=0.05)
@@ -175,7 +169,7 @@ PAIR = ("fork", "flange")
 COARSE = PreparationSettings(
     parts=PartSettings(voxels=50_000),
     spheres=SphereSettings(candidates=300, rounds=2),
-    sampling=SamplingSettings(samples=1000, descents=3),
+    sampling=self_collisions.SamplingSettings(samples=1000, descents=3),
     samples=500,
 )
 

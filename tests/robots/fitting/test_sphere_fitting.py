@@ -111,15 +111,11 @@ def test_covered_finds_a_small_gap() -> None:
     assert not covered(meshes, spheres - np.array([0, 0, 0, 2e-4]))
 
 
-def two_cylinders() -> Robot:
-    """Two upright cylinders; the upper one rotates on the lower one."""
+def test_spheres_may_reach_into_a_neighbor_unless_it_turns_away() -> None:
+    """Of two upright cylinders, the upper one rotates on the lower one."""
     can = convex_hull(np.array(trimesh.creation.cylinder(0.05, 0.2, sections=48).vertices) + np.array([0, 0, 0.1]))
     turn = Joint("turn", "revolute", "low", "high", transform(np.array([0, 0, 0.2])), np.array([0, 0, 1.0]), -3.0, 3.0)
-    return Robot("cans", "low", "high", (turn,), meshes={"low": (can,), "high": (can,)})
-
-
-def test_spheres_may_reach_into_a_neighbor_unless_it_turns_away() -> None:
-    robot = two_cylinders()
+    robot = Robot("cans", "low", "high", (turn,), meshes={"low": (can,), "high": (can,)})
     (beside,) = neighbors(robot, "low")
     assert beside.link == "high" and len(beside.T_link_neighbor) > 1
     hidden = hidden_by_neighbors(robot, "low")

@@ -17,25 +17,18 @@ def finger(i: int, count: int) -> str:
     return chain("j6_link", row(f"f{i}_", count))
 
 
+TCP = link("tcp", "") + joint("tool", "j6_link", "tcp", "fixed")
+MIMIC = '<mimic joint="drive" multiplier="-1"/>'
+FIVE = "".join(link(f"m{i}") + joint(f"m{i}_joint", "j6_link", f"m{i}", more=MIMIC) for i in range(5))
 END = {
     "nothing": ("", "j6_link"),
     "flange": (link("flange", "") + joint("mount", "j6_link", "flange", "fixed"), "flange"),
     "two fingers": (finger(1, 1) + finger(2, 1), "j6_link"),
     "a hand of five fingers": ("".join(finger(i, 4) for i in range(5)), "j6_link"),
     "a jaw": (chain("j6_link", ["gripper"]), "j6_link"),
-    "a jaw beside a fixed frame": (
-        chain("j6_link", ["left_jaw"]) + link("tcp", "") + joint("tool", "j6_link", "tcp", "fixed"),
-        "j6_link",
-    ),
+    "a jaw beside a fixed frame": (chain("j6_link", ["left_jaw"]) + TCP, "j6_link"),
     "a jaw that only its link names": (link("arm_fngr") + joint("f1x", "j6_link", "arm_fngr"), "j6_link"),
-    "a gripper of one joint that five follow": (
-        chain("j6_link", ["drive"])
-        + "".join(
-            link(f"m{i}") + joint(f"m{i}_joint", "j6_link", f"m{i}", more='<mimic joint="drive" multiplier="-1"/>')
-            for i in range(5)
-        ),
-        "j6_link",
-    ),
+    "a gripper of one joint that five follow": (chain("j6_link", ["drive"]) + FIVE, "j6_link"),
 }
 """End effectors by name, and the link where the arm ends."""
 
@@ -136,12 +129,9 @@ def test_mimic_joints_follow(tmp_path: Path) -> None:
 
 def test_mimics_of_planned_joints_raise_unless_they_are_locked(tmp_path: Path) -> None:
     bar = link("bar") + joint("rod", "j1_link", "bar", more='<mimic joint="j2" multiplier="-1"/>')
-    refuses(
-        r"rod mimics j2, which is planned; .*--lock j2=VALUE.*, or remove rod and what it carries",
-        read_urdf,
-        written(tmp_path, ARM, bar),
-    )
-    held = read_urdf(written(tmp_path, ARM, bar), locked={"j2": 0.5})
+    file = written(tmp_path, ARM, bar)
+    refuses(r"rod mimics j2, which is planned; .*--lock j2=VALUE.*, or remove rod and what it carries", read_urdf, file)
+    held = read_urdf(file, locked={"j2": 0.5})
     assert held.locked == {"rod": -0.5, "j2": 0.5} and held.dof == 5
     framed = read_urdf(written(tmp_path, ARM, bar.replace(link("bar"), link("bar", ""))))
     assert framed.dof == 6 and "the pose of bar is wrong" in "".join(framed.notes)

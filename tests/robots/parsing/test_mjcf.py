@@ -69,11 +69,9 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-@pytest.fixture(scope="module")
-def arm(file: Path, tmp_path_factory: pytest.TempPathFactory) -> rd.Robot:
-    settings = replace(QUICK, sampling=SamplingSettings(samples=300, descents=3))
-    with coarse_grids():
-        return add_robot(file, out=tmp_path_factory.mktemp("robots") / "arm", settings=settings).robot
+def read(folder: Path, text: str) -> UrdfTree:
+    (folder / "m.xml").write_text(text)
+    return UrdfTree(folder / "m.xml", {})
 
 
 def state_of(model: Any, robot: rd.Robot, q: np.ndarray) -> Any:
@@ -106,18 +104,18 @@ def test_frames_limits_poses_and_mimics_are_those_of_mujoco(file: Path) -> None:
     assert any("no velocity limit" in note for note in robot.notes)
 
 
-def test_self_collisions_are_those_of_mujoco(file: Path, arm: rd.Robot) -> None:
+def test_self_collisions_are_those_of_mujoco(file: Path, tmp_path: Path) -> None:
     """MuJoCo and the validator's meshes agree on contacts deeper than 1 mm; pairs that the model excludes are free."""
+    settings = replace(QUICK, sampling=SamplingSettings(samples=300, descents=3))
+    with coarse_grids():
+        arm = add_robot(file, out=tmp_path / "arm", settings=settings).robot
     model = mujoco.MjModel.from_xml_path(str(file))
     checker = CollisionChecker(arm, rd.Scene())
     collisions = 0
     for q in np.random.default_rng(1).uniform(arm.lower, arm.upper, (200, arm.dof)):
         data = state_of(model, arm, q)
-        bodies = [
-            {model.body(model.geom_bodyid[geom]).name for geom in contact.geom}
-            for contact in data.contact
-            if contact.dist < -1e-3
-        ]
+        touching = [contact.geom for contact in data.contact if contact.dist < -1e-3]
+        bodies = [{model.body(model.geom_bodyid[geom]).name for geom in pair} for pair in touching]
         deep = [pair for pair in bodies if pair <= set(arm.link_names)]
         assert not deep or not checker.free(q[None])[0], (q, deep)
         collisions += bool(deep)
@@ -136,16 +134,6 @@ def test_a_scene_is_all_that_is_not_the_robot(file: Path) -> None:
     np.testing.assert_allclose(crate.bounds, [[0.55, -0.1, 0.2], [0.65, 0.3, 0.4]])
     np.testing.assert_allclose(rd.Scene.from_mujoco(model, data, base="base").shapes[0].bounds[1, 2], -0.55)
     refuses("body", rd.Scene.from_mujoco, model, base="bse")
-
-
-def test_a_plane_is_never_smaller_than_where_mujoco_collides() -> None:
-    """Regression: a floor with a size became a box of this size, which MuJoCo only draws."""
-    world = '<geom type="plane" size="0.1 7 1"/><body pos="3 0 0.05"><freejoint/><geom size="0.1"/></body>'
-    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{world}</worldbody></mujoco>")
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    assert data.ncon == 1
-    np.testing.assert_allclose(rd.Scene.from_mujoco(model).shapes[0].bounds, [[-5, -7, -0.1], [5, 7, 0]])
 
 
 FIELD = '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>'
@@ -176,8 +164,7 @@ HILLY = f"""<mujoco>{FIELD}<worldbody><body name="b">
 
 
 def test_a_height_field_that_collides_with_nothing_is_left_out(tmp_path: Path) -> None:
-    (tmp_path / "m.xml").write_text(HILLY.format('contype="0" conaffinity="0" mass="0"'))
-    assert len(UrdfTree(tmp_path / "m.xml", {}).surfaces("b")) == 1
+    assert len(read(tmp_path, HILLY.format('contype="0" conaffinity="0" mass="0"')).surfaces("b")) == 1
 
 
 BODY = "<mujoco><worldbody><body>{}<geom size='1'/></body></worldbody></mujoco>"
@@ -197,8 +184,7 @@ BODY = "<mujoco><worldbody><body>{}<geom size='1'/></body></worldbody></mujoco>"
     ],
 )
 def test_bad_models_are_one_line(text: str, wanted: str, tmp_path: Path) -> None:
-    (tmp_path / "m.xml").write_text(text)
-    refuses(wanted, lambda: UrdfTree(tmp_path / "m.xml", {}).robot())
+    refuses(wanted, lambda: read(tmp_path, text).robot())
 
 
 NAMED = """
@@ -223,25 +209,19 @@ PAIRS = '<pair geom1="foot" geom2="palm"/><pair geom1="post" geom2="palm"/>'
 
 
 def test_geoms_of_named_pairs_collide(tmp_path: Path) -> None:
-    """Regression: geoms that collide only in pairs that the model names were left out, so MuJoCo saw contacts where the arm
-    counted as free; and a named pair counted as excluded, if masks or an exclusion excluded its bodies."""
-    file = tmp_path / "m.xml"
-    file.write_text(NAMED.format(f'<exclude body1="base" body2="hand"/>{PAIRS}'))
-    tree = UrdfTree(file, {})
+    """Regression: geoms that collide only in named pairs were left out, and named pairs of excluded bodies were excluded."""
+    tree = read(tmp_path, NAMED.format(f'<exclude body1="base" body2="hand"/>{PAIRS}'))
     assert [len(tree.surfaces(link)) for link in ("base", "arm", "hand")] == [1, 1, 1]
     assert tree.semantics is not None
     assert set(tree.semantics.allowed) == {frozenset(("arm", "hand"))}
-    [post] = rd.Scene.from_mujoco(mujoco.MjModel.from_xml_path(str(file))).shapes
+    [post] = rd.Scene.from_mujoco(mujoco.MjModel.from_xml_path(str(tmp_path / "m.xml"))).shapes
     assert post.name == "post"
 
 
 def test_a_model_with_other_exclusions_or_keyframes_is_another_robot(tmp_path: Path) -> None:
-    """Regression: `load_robot` took the robot that had been prepared before a pair of links was checked again, so this pair
-    stayed unchecked; named poses stayed old, too."""
-    digests = []
-    for old, new in (("", ""), ("", ""), ('body2="elbow"', 'body2="wrist"'), ("0.5 0.1 0.4", "0.5 0.1 0.5")):
-        (tmp_path / "m.xml").write_text(ARM.replace(old, new))
-        digests.append(UrdfTree(tmp_path / "m.xml", {}).digest)
+    """Regression: `load_robot` took the robot that had been prepared with the old exclusions and poses."""
+    changes = ("", ""), ("", ""), ('body2="elbow"', 'body2="wrist"'), ("0.5 0.1 0.4", "0.5 0.1 0.5")
+    digests = [read(tmp_path, ARM.replace(old, new)).digest for old, new in changes]
     assert digests[0] == digests[1]
     assert len(set(digests)) == 3
 
@@ -268,8 +248,7 @@ TIED = """
 
 def test_constraints_that_are_not_followed_are_noted(tmp_path: Path) -> None:
     """Regression: only polynomials of joints were noted; then, all but limits of tendons."""
-    (tmp_path / "m.xml").write_text(TIED.replace('name="t"', 'name="t" range="0 1"'))
-    tree = UrdfTree(tmp_path / "m.xml", {})
+    tree = read(tmp_path, TIED.replace('name="t"', 'name="t" range="0 1"'))
     assert "the limits of tendon t are ignored" in tree.notes
     notes = [note for note in tree.robot().notes if "equality" in note]
     for note, kind in zip(notes, ("joint", "connect", "tendon"), strict=True):
@@ -295,8 +274,7 @@ PLACED = """
 @pytest.mark.parametrize("actuator", ["", "<actuator><position joint='x'/></actuator></mujoco>"])
 def test_a_base_on_slides_without_range_is_held(actuator: str, tmp_path: Path) -> None:
     """As of Fetch in Gymnasium-Robotics, where nothing moves the slides, and of TidyBot, which drives on them."""
-    (tmp_path / "m.xml").write_text(PLACED.replace("</mujoco>", actuator or "</mujoco>"))
-    tree = UrdfTree(tmp_path / "m.xml", {})
+    tree = read(tmp_path, PLACED.replace("</mujoco>", actuator or "</mujoco>"))
     robot = tree.robot(srdf=tree.semantics)
     assert robot.joint_names == ("j",)
     assert robot.poses["home"] == {"j": 0.5}
@@ -304,7 +282,7 @@ def test_a_base_on_slides_without_range_is_held(actuator: str, tmp_path: Path) -
     np.testing.assert_allclose(robot.fk(np.array([0.0]), "base")[:3, 3], [0.1, 0, 0.2], atol=1e-12)
 
 
-def test_a_scene_around_a_robot_that_has_moved_names_its_base(tmp_path: Path) -> None:
+def test_a_scene_around_a_robot_that_has_moved_names_its_base() -> None:
     """Regression: obstacles were where the simulation has them, but the robot where its model places it."""
     box = '<geom name="box" size="0.1 0.1 0.1" type="box" pos="1.1 0 0.2"/>'
     model = mujoco.MjModel.from_xml_string(PLACED.replace("<worldbody>", f"<worldbody>{box}"))
@@ -317,17 +295,17 @@ def test_a_scene_around_a_robot_that_has_moved_names_its_base(tmp_path: Path) ->
     np.testing.assert_allclose(shape.bounds.mean(axis=0), [0.6, 0, 0], atol=1e-12)
 
 
-def test_planes_are_boxes_around_the_base() -> None:
-    """Regression: a floor drawn far from the robot was an obstacle only there, but in MuJoCo nothing passes it anywhere."""
+def test_planes_are_boxes_around_the_base_at_least_as_large_as_drawn() -> None:
+    """Regression: floors were obstacles only where MuJoCo draws them, but in MuJoCo nothing passes them anywhere."""
     model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody>
-      <geom name="floor" type="plane" size="0.1 0.1 0.1" pos="7 0 -0.2"/>
+      <geom name="floor" type="plane" size="0.1 7 0.1" pos="7 0 -0.2"/>
       <geom name="ramp" type="plane" size="0 0 0.1" pos="3 0 0" euler="0 30 0" contype="2" conaffinity="0"/>
       <body pos="-2 0 0.29"><freejoint/><geom size="0.5"/></body></worldbody></mujoco>""")
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     assert data.contact.dist == pytest.approx([-0.01])
     floor, ramp, _ = rd.Scene.from_mujoco(model, data).shapes
-    np.testing.assert_allclose(floor.bounds, [[-5, -5, -0.3], [5, 5, -0.2]], atol=1e-12)
+    np.testing.assert_allclose(floor.bounds, [[-5, -7, -0.3], [5, 7, -0.2]], atol=1e-12)
     normal = np.array([0.5, 0, np.sqrt(0.75)])
     np.testing.assert_allclose(ramp.bounds.mean(axis=0), (1.5 - 0.05) * normal, atol=1e-12)  # the plane is 1.5 m from the base
 
@@ -335,8 +313,7 @@ def test_planes_are_boxes_around_the_base() -> None:
 def test_a_free_body_with_joints_is_the_robot_if_nothing_else_is(tmp_path: Path) -> None:
     """Regression: a humanoid without actuators "has no robot: no body is moved by a hinge or a slide joint"."""
     free = '<joint name="x" type="free"/>'
-    (tmp_path / "m.xml").write_text(re.sub("<joint name=.x.*?/>", free, PLACED).replace("0.3 0.5", "0 0 1 1 0 0 0 0.5"))
-    tree = UrdfTree(tmp_path / "m.xml", {})
+    tree = read(tmp_path, re.sub("<joint name=.x.*?/>", free, PLACED).replace("0.3 0.5", "0 0 1 1 0 0 0 0.5"))
     assert tree.robot().joint_names == ("j",)
     assert any("the free joint of base is held" in note for note in tree.notes)
 
@@ -381,8 +358,7 @@ TURNED = """
 
 def test_mirrored_meshes_are_where_mujoco_has_them_and_what_is_not_driven_is_none(tmp_path: Path) -> None:
     trimesh.creation.box([0.1, 0.2, 0.1]).apply_translation([0.02, 0.05, 0.0]).export(tmp_path / "part.stl")
-    (tmp_path / "m.xml").write_text(TURNED)
-    tree = UrdfTree(tmp_path / "m.xml", {})
+    tree = read(tmp_path, TURNED)
     robot = tree.robot()
     assert robot.joint_names == ("j",) and "other" not in robot.link_names
     data = state_of(mujoco.MjModel.from_xml_path(str(tmp_path / "m.xml")), robot, np.array([0.5]))
@@ -406,7 +382,6 @@ def test_meshes_that_collide_are_hulls_as_for_mujoco(tmp_path: Path) -> None:
     vertices = np.concatenate([leg.vertices for leg in legs])
     faces = np.concatenate([legs[0].faces, legs[1].faces + len(legs[0].vertices)])
     numbers = (" ".join(map(str, values.ravel().tolist())) for values in (vertices, faces))
-    (tmp_path / "m.xml").write_text(HOLLOW.format(*numbers))
-    [surface] = UrdfTree(tmp_path / "m.xml", {}).surfaces("base")
+    [surface] = read(tmp_path, HOLLOW.format(*numbers)).surfaces("base")
     bounds = surface.vertices.max(axis=0) - surface.vertices.min(axis=0)
     np.testing.assert_allclose(trimesh.Trimesh(surface.vertices, surface.faces).volume, np.prod(bounds), rtol=1e-6)

@@ -11,13 +11,12 @@ import pytest
 import trimesh
 
 import robotdiffuse as rd
-import robotdiffuse.robots as robots
 from helpers.made_arms import BALL, chain, joint, link, read_urdf, row, written
 from helpers.quick_preparation import QUICK, coarse_grids
 from helpers.refusals import refuses
 from robotdiffuse.core import output_files
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
-from robotdiffuse.robots import load_robot, robot_folder
+from robotdiffuse.robots import DATA, load_robot, robot_folder
 from robotdiffuse.robots.fitting import preparation
 from robotdiffuse.robots.fitting.convex_parts import MIN_THICKNESS, Surface, convex_hull
 from robotdiffuse.robots.fitting.preparation import PreparationSettings, add_robot
@@ -40,8 +39,6 @@ ARM = """<robot name="tiny">
     <axis xyz="0 1 0"/></joint>
 </robot>
 """
-BOX = '<box size="0.06 0.06 0.3"/>'
-TUBE = '<cylinder radius="0.03" length="0.2"/>'
 GRIPPER = """
   <link name="palm"/> <link name="left"/> <link name="right"/> <link name="tcp"/>
   <joint name="mount" type="fixed"><parent link="fore"/><child link="palm"/></joint>
@@ -135,7 +132,7 @@ def test_robot_folder_round_trip(tmp_path: Path) -> None:
 
 
 def damage_json(**change: object) -> str:
-    data = json.loads((robots.DATA / "panda" / "robot.json").read_text()) | change
+    data = json.loads((DATA / "panda" / "robot.json").read_text()) | change
     return json.dumps({key: value for key, value in data.items() if value is not None})
 
 
@@ -153,7 +150,7 @@ def damage_json(**change: object) -> str:
 )
 def test_damaged_folder_names_the_file(file: str, content: str, tmp_path: Path) -> None:
     for name in ("robot.json", "meshes.npz"):
-        (tmp_path / name).write_bytes((robots.DATA / "panda" / name).read_bytes())
+        (tmp_path / name).write_bytes((DATA / "panda" / name).read_bytes())
     (tmp_path / file).write_text(content)
     refuses(file, read_robot_folder, tmp_path)
     (tmp_path / file).unlink()
@@ -173,10 +170,8 @@ def test_limits_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(robot.jerk, [80, 35])
     np.testing.assert_allclose(robot.lower, [-2, -1])
     file.write_text("default_velocity_scaling_factor: 0.1\njoint_limits: {j: {max_velocity: 1}}\n")
-    assert read_limits(file) == (
-        {"j": {"velocity": 1.0}},
-        ("limits.yaml: default_velocity_scaling_factor 0.1 is ignored; plan with velocity_scaling=0.1",),
-    )
+    note = "limits.yaml: default_velocity_scaling_factor 0.1 is ignored; plan with velocity_scaling=0.1"
+    assert read_limits(file) == ({"j": {"velocity": 1.0}}, (note,))
     for text, message in (
         ("joint_limits: [", "not valid YAML"),
         ("limits: {}", "no joint_limits"),
@@ -201,8 +196,7 @@ def test_limits_of_a_file_decide_which_joints_are_held(tmp_path: Path) -> None:
 
 def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
-    # balls, because they are fitted quickly
-    balls = ARM.replace(BOX, '<sphere radius="0.15"/>').replace(TUBE, '<sphere radius="0.1"/>')
+    balls = re.sub("<(box|cylinder) .*?/>", '<sphere radius="0.15"/>', ARM)  # which are fitted quickly
     file = urdf(tmp_path, balls)
     steps = []
     quick = PreparationSettings(sampling=SamplingSettings(samples=200), samples=200, rounds=0)
@@ -243,12 +237,6 @@ def test_quaternions_of_joints_turn_what_follows(tmp_path: Path) -> None:
     np.testing.assert_allclose(first, second, atol=1e-12)
 
 
-def test_limits_of_continuous_joints_are_ignored(tmp_path: Path) -> None:
-    """Regression: propellers and wheels with limits of 1e16 or inf were refused."""
-    parts = chain("base", ["j"], kind="continuous", limits='lower="-1e+16" upper="inf"')
-    assert read_urdf(written(tmp_path, parts)).upper == [CONTINUOUS_LIMIT]
-
-
 def test_a_wheel_without_limits_is_held_and_a_planned_joint_without_limits_is_refused(tmp_path: Path) -> None:
     """Regression: Centauro was refused for the sake of its wheels, which no arm needs."""
     wheel = [link("wheel"), joint("wheel_joint", "base", "wheel", limits="")]
@@ -260,7 +248,9 @@ def test_a_wheel_without_limits_is_held_and_a_planned_joint_without_limits_is_re
 
 
 def test_limits_beyond_all_measure_stand_for_none(tmp_path: Path) -> None:
-    """Regression: iCub (1e9 rad/s) and a drone's propellers (revolute, within 1e16 rad) were refused."""
+    """Regression: iCub (1e9 rad/s), and wheels and propellers, continuous or revolute, with 1e16 rad or inf were refused."""
+    endless = chain("base", ["j"], kind="continuous", limits='lower="-1e+16" upper="inf"')
+    assert read_urdf(written(tmp_path, endless)).upper == [CONTINUOUS_LIMIT]
     fast = chain("base", ["j"]).replace('velocity="2"', 'velocity="1e+9"')
     propeller = link("propeller") + joint("turn", "base", "propeller", limits='lower="0.5" upper="1e+16"')
     robot = read_urdf(written(tmp_path, fast, propeller), tip="j_link")
@@ -393,8 +383,7 @@ def test_polyhedra_lie_closely_around_primitives(tmp_path: Path, shape: str, vol
 
 
 def test_meshes_by_package_relative_and_scaled(tmp_path: Path) -> None:
-    package = tmp_path / "my_arm"
-    (package / "meshes").mkdir(parents=True)
+    package = mesh(tmp_path / "my_arm")
     (package / "urdf").mkdir()
     trimesh.creation.annulus(0.02, 0.03, 0.1).export(package / "meshes" / "ring.stl")
     for name in ("package://my_arm/meshes/ring.stl", "../meshes/ring.stl"):
@@ -432,7 +421,6 @@ def mesh(folder: Path) -> Path:
 
 def test_packages_by_option_environment_and_upwards(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     far = mesh(tmp_path / "ws" / "src" / "some_arm")
-    (tmp_path / "elsewhere").mkdir()
     file = written(tmp_path / "elsewhere", PARTS)
     assert NAME in refuses("--package some_arm=FOLDER, or ROS_PACKAGE_PATH", read_urdf, file)
     assert "end" in read_urdf(file, packages={"some_arm": far}).meshes
@@ -445,7 +433,6 @@ def test_packages_by_option_environment_and_upwards(tmp_path: Path, monkeypatch:
         with monkeypatch.context() as patch:
             patch.setenv(variable, f"/nowhere:{folder}")
             assert "end" in read_urdf(file).meshes
-    (far / "urdf").mkdir()
     file = written(far / "urdf", PARTS)
     assert "end" in read_urdf(file).meshes
     (far / "meshes" / "box.stl").unlink()
@@ -453,6 +440,7 @@ def test_packages_by_option_environment_and_upwards(tmp_path: Path, monkeypatch:
 
 
 def xacro(folder: Path, content: str, name: str = "made.urdf.xacro") -> Path:
+    folder.mkdir(exist_ok=True)
     file = folder / name
     file.write_text(f'<robot name="made" xmlns:xacro="http://www.ros.org/wiki/xacro">{content}</robot>')
     return file
@@ -462,9 +450,7 @@ def test_xacro_is_compiled_with_what_it_includes(tmp_path: Path) -> None:
     pytest.importorskip("xacrodoc")
     part = mesh(tmp_path / "some_arm")
     macro = '<xacro:macro name="solid" params="name"><link name="${name}">' + BALL + "</link></xacro:macro>"
-    (part / "urdf").mkdir()
     xacro(part / "urdf", macro, "solid.xacro")
-    (tmp_path / "top").mkdir()
     content = (
         '<xacro:include filename="$(find some_arm)/urdf/solid.xacro"/><xacro:property name="n" value="3"/>'
         '<xacro:solid name="base"/>' + PARTS.replace('name="j3"', 'name="j${n}"')
@@ -481,10 +467,9 @@ def test_xacro_is_compiled_with_what_it_includes(tmp_path: Path) -> None:
 def test_xacro_includes_files_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In any working directory. A file named .urdf can also contain xacro."""
     pytest.importorskip("xacrodoc")
-    mesh(tmp_path / "some_arm")
-    (tmp_path / "some_arm" / "part").mkdir()
-    xacro(tmp_path / "some_arm" / "part", PARTS, "arm.xacro")
-    file = xacro(tmp_path / "some_arm", link("base") + '<xacro:include filename="part/arm.xacro"/>', "made.urdf")
+    folder = mesh(tmp_path / "some_arm")
+    xacro(folder / "part", PARTS, "arm.xacro")
+    file = xacro(folder, link("base") + '<xacro:include filename="part/arm.xacro"/>', "made.urdf")
     monkeypatch.chdir("/")
     assert read_urdf(file).dof == 4
 
