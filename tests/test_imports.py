@@ -17,11 +17,9 @@ SOURCE = ROOT / "src" / "robotdiffuse"
 MODULES = sorted(SOURCE.rglob("*.py"))
 ORDER = (
     *("core", "processes", "robots", "scenes", "collision", "perception"),
-    *("drawables", "problems", "trajectories"),
-    "validation",
+    *("drawables", "problems", "trajectories", "validation"),
     *("certificates", "interop", "datasets", "learning", "planning", "baselines", "adapters"),
-    *("generation", "simulation"),
-    *("evaluation", "visualization", "server", "cli"),
+    *("generation", "simulation", "evaluation", "visualization", "server", "cli"),
 )
 """A package imports only itself and packages before it."""
 APART = {

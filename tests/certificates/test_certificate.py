@@ -79,12 +79,10 @@ def micro_steps(time: float) -> tuple[np.ndarray, np.ndarray]:
     return 1.9e-6 * np.arange(5264.0), np.arange(5264) * time
 
 
+# 2 rad in 20 ms, and a row a nanosecond after the last
+SHORT_STEP = np.append(np.linspace(0, 2, 21), 2.0), np.append(np.arange(21) * 1e-3, 0.02 + 1e-9)
 TOO_QUICK = {
-    # 2 rad in 20 ms, and a row a nanosecond after the last
-    "one short step": (
-        (np.append(np.linspace(0, 2, 21), 2.0), np.append(np.arange(21) * 1e-3, 0.02 + 1e-9)),
-        "mean velocity between rows",
-    ),
+    "one short step": (SHORT_STEP, "mean velocity between rows"),
     "1e-8 s": (micro_steps(1e-8), "mean velocity from one row to another"),
     "5e-7 s": (micro_steps(5e-7), "mean velocity from one row to another"),
     "1e-6 s": (micro_steps(1e-6), "mean acceleration by its positions"),

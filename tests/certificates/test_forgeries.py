@@ -155,6 +155,7 @@ def without(record: Record, name: str, **rest: Any) -> None:
     record.update(rest)
 
 
+IN_THE_WAY = {"sphere": {"center": [0, 0, 0.6], "radius": 0.3}}
 CLOSED = {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0}
 FORGED: dict[str, tuple[Callable[[Record], object], str]] = {
     # planes
@@ -252,10 +253,7 @@ FORGED: dict[str, tuple[Callable[[Record], object], str]] = {
     "closed fingers": (set_to("problem", "locked", to=CLOSED), "joint panda_finger_joint1 has changed"),
     "a faster ball": (set_to("problem", "moving", 0, "velocity", to=[0, -1, 0]), "shown to be free|proof: "),
     "a ball of unknown motion": (lambda record: record["problem"]["moving"][0].update(velocity=None, max_speed=1.0), "proof: "),
-    "an obstacle in the way": (
-        lambda record: record["problem"]["scene"].append({"sphere": {"center": [0, 0, 0.6], "radius": 0.3}}),
-        "is not shown to be free",
-    ),
+    "an obstacle in the way": (lambda record: record["problem"]["scene"].append(IN_THE_WAY), "is not shown to be free"),
     # the hashes are not forged
     "an obstacle left out": (lambda record: record["problem"]["scene"].pop(), "scene: table is missing"),
     "a moved waypoint": (set_to("motion", "positions", 7, 2, to=0.1), "not the one that was certified: its"),

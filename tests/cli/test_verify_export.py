@@ -9,13 +9,9 @@ import yaml
 from helpers.commands import BALL, PROBLEM, Said, run
 from helpers.full_disk import full_disk
 
-OBJECT = {
-    "header": {"frame_id": "panda_link0"},
-    "id": "ball",
-    "primitives": [{"type": "sphere", "dimensions": [0.15]}],
-    "primitive_poses": [{"position": [0.5, 0.0, 0.5], "orientation": [0, 0, 0, 1]}],
-}
-SCENE = {"world": {"collision_objects": [OBJECT]}}
+POSES = [{"position": [0.5, 0.0, 0.5], "orientation": [0, 0, 0, 1]}]
+OBJECT = {"header": {"frame_id": "panda_link0"}, "id": "ball", "primitives": [{"type": "sphere", "dimensions": [0.15]}]}
+SCENE = {"world": {"collision_objects": [OBJECT | {"primitive_poses": POSES}]}}
 
 
 @pytest.fixture(autouse=True)

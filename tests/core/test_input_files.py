@@ -98,14 +98,8 @@ def test_brackets_in_texts_are_no_nesting() -> None:
 
 def test_what_yaml_means() -> None:
     text = "{a: 1e-3, b: [0x10, -2, yes, ~, 1:30, 2001-13-45], c: &x {d: .inf}, e: *x, f: '1', g: 1.5e3}"
-    assert input_files.parse_yaml(text, "it") == {
-        "a": 0.001,
-        "b": [16, -2, True, None, 90, "2001-13-45"],
-        "c": {"d": np.inf},
-        "e": {"d": np.inf},
-        "f": "1",
-        "g": 1500.0,
-    }
+    meant = {"a": 0.001, "b": [16, -2, True, None, 90, "2001-13-45"], "f": "1", "g": 1500.0}
+    assert input_files.parse_yaml(text, "it") == meant | {"c": {"d": np.inf}, "e": {"d": np.inf}}
     assert input_files.parse_yaml("", "it") is None
     assert input_files.parse_yaml("{1: a, on: b, ~: c}", "it") == {"1": "a", "on": "b", "~": "c"}
 

@@ -137,13 +137,9 @@ def test_one_centimeter_and_fifteen_degrees_are_settings(shift: float, angle: fl
 
 
 def test_wilson_interval() -> None:
-    for successes, n, low, high in (
-        # R. G. Newcombe 1998, table 1, method 3
-        (81, 263, 0.2553, 0.3662),
-        (0, 20, 0.0, 0.1611),
-        (1, 29, 0.0061, 0.1718),
-        (0, 0, 0.0, 1.0),
-    ):
+    """R. G. Newcombe 1998, table 1, method 3."""
+    table = (81, 263, 0.2553, 0.3662), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718), (0, 0, 0.0, 1.0)
+    for successes, n, low, high in table:
         assert statistics.wilson_interval(successes, n) == pytest.approx((low, high), abs=5e-5)
 
 

@@ -14,6 +14,7 @@ from importlib.metadata import PackageNotFoundError
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -385,10 +386,6 @@ def test_a_worker_killed_from_outside_is_one_line_and_the_next_call_goes_on(undi
 
 def test_a_missing_zarr_is_said_before_any_planning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Regression: without the extra `data`, `data generate` ended with a traceback."""
-
-    def version(name: str) -> str:
-        raise PackageNotFoundError(name)
-
-    monkeypatch.setattr(factory, "version", version)
+    monkeypatch.setattr(factory, "version", Mock(side_effect=PackageNotFoundError("zarr")))
     refuses(r'zarr, not installed: pip install "robotdiffuse\[data\]"', generate, SETTINGS, tmp_path)
     assert not list(tmp_path.iterdir())

@@ -95,14 +95,13 @@ WORKS: dict[str, tuple[Callable[[Path], Path], int]] = {
     "xacro": (text(XACRO.format(robot(ARM).split(">", 1)[1][: -len("</robot>")]), "made.urdf.xacro"), 4),
 }
 """What is made, and how many joints are planned."""
+FLOATING = link("body") + joint("free", "base", "body", "floating")
 NOTHING = "<robot name='bare'><link name='base'/></robot>"
+NO_NUMBERS = b"v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 2 3 4\n"
 REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "a missing mesh": (arm(ARM, ending("a.stl")), "mesh file 'a.stl' does not exist; add it"),
     "no geometry": (text(robot(ARM).replace(BALL, "")), "add <collision> elements"),
-    "a floating base": (
-        arm(link("body"), joint("free", "base", "body", "floating"), chain("body", row("j", 6))),
-        "has type 'floating'; .*--base body to plan",
-    ),
+    "a floating base": (arm(FLOATING, chain("body", row("j", 6))), "has type 'floating'; .*--base body to plan"),
     "a closed chain": (arm(ARM, joint("close", "base", "j4_link")), "two parent joints .*remove one"),
     "a link that is not there": (arm(ARM, joint("last", "j4_link", "hand")), "'hand'"),
     "no limits": (arm(chain("base", ["j"], limits="")), "j: no <limit lower= upper=>; add it"),
@@ -119,23 +118,17 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "an axis of zero length": (arm(chain("base", row("j", 3), axis="0 0 0")), "its axis is zero"),
     "limits that are no numbers": (arm(chain("base", ["j"], limits='lower="nan" upper="1"')), "is 'nan'"),
     "a triangle": (solid(trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])), "has no triangle mesh"),
-    "a mesh with corners that are no numbers": (
-        solid(b"v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 2 3 4\n", "part.obj"),
-        "has no triangle mesh",
-    ),
+    "corners that are no numbers": (solid(NO_NUMBERS, "part.obj"), "has no triangle mesh"),
     "a damaged mesh": (solid(b"this is no mesh", "part.dae"), "not well-formed"),
     "two links of one name": (arm(ARM, link("j4_link")), "two links have the name 'j4_link'"),
     "two joints of one name": (arm(ARM, link("end"), joint("j4", "j4_link", "end")), "two joints have the name 'j4'"),
-    "two rotations": (
-        text(robot(ARM).replace('<origin xyz="0 0 0.1"/>', '<origin rpy="0 0 0" quat_xyzw="0 0 0 1"/>')),
-        "must have one of them",
-    ),
+    "two rotations": (text(robot(ARM).replace('xyz="0 0 0.1"', 'rpy="0 0 0" quat_xyzw="0 0 0 1"')), "must have one of them"),
     "a finger with exchanged limits": (
         arm(ARM, chain("j4_link", ["finger"], limits='lower="0" upper="-0.03"')),
         "lower limit 0.0 is above upper -0.03; exchange them",
     ),
     "joints without a range": (arm(chain("base", ["j"], limits='lower="0" upper="0"')), "limits of j leave no"),
-    "a floating body": (arm(ARM, link("ball"), joint("free", "base", "ball", "floating")), "remove it with what it carries"),
+    "a floating body": (arm(ARM, FLOATING), "remove it with what it carries"),
     "a hand in millimeters": (
         solid(trimesh.creation.box([50, 100, 300])),
         'link end is 300 m long; .* scale="0.001 0.001 0.001"',

@@ -81,14 +81,10 @@ def test_pybullets_camera_sees_the_same(tmp_path: Path) -> None:
         for shape, visual in seen:
             w, *xyz = shape.wxyz.tolist() if isinstance(shape, rd.Box) else (1.0, 0.0, 0.0, 0.0)
             pybullet.createMultiBody(0.0, -1, visual, shape.center.tolist(), [*xyz, w])
-        *_, depth, bodies = pybullet.getCameraImage(
-            width,
-            height,
-            pybullet.computeViewMatrix(eye, target, (0, 0, 1)),
-            pybullet.computeProjectionMatrixFOV(np.degrees(field), width / height, near, far),
-            shadow=0,
-            renderer=pybullet.ER_TINY_RENDERER,
-        )
+        placed = pybullet.computeViewMatrix(eye, target, (0, 0, 1))
+        lens = pybullet.computeProjectionMatrixFOV(np.degrees(field), width / height, near, far)
+        tiny = pybullet.ER_TINY_RENDERER
+        *_, depth, bodies = pybullet.getCameraImage(width, height, placed, lens, shadow=0, renderer=tiny)
     finally:
         pybullet.disconnect(client)
     found = np.reshape(bodies, (height, width)) >= 0

@@ -48,16 +48,12 @@ def test_balls_seen_through_are_those_with_nothing_in_any_of_their_pixels() -> N
     radius = 0.02
     far = (BALLS - T[:3, 3]) @ T[:3, 2] + radius
     seen = seen_in(depth, radius=radius)
-    least, most = (
-        np.array(
-            [
-                pixels is not None and bool((pixels > behind).all())
-                for ball, behind in zip(BALLS, far, strict=True)
-                for pixels in [returns(depth, ball, radius, more)]
-            ]
-        )
-        for more in (3, 0)
-    )
+
+    def empty(more: int) -> np.ndarray:
+        pixels = (returns(depth, ball, radius, more) for ball in BALLS)
+        return np.array([of is not None and bool((of > behind).all()) for of, behind in zip(pixels, far, strict=True)])
+
+    least, most = empty(3), empty(0)
     assert 100 < least.sum() < seen.sum() < most.sum() < len(BALLS)
     assert not (least & ~seen).any() and not (seen & ~most).any()
 

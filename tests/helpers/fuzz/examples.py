@@ -23,14 +23,10 @@ SMALL = PROBLEM | {"scene": PROBLEM["scene"][:1]}
 ROWS = np.linspace(PROBLEM["start"], PROBLEM["goal"]["joints"], 3).tolist()
 POSE = {"frame": "panda_hand", "xyz": [0.5, 0, 0.5], "wxyz": [0, 1, 0, 0]}
 VIEW = {"cloud": [[1, 0, 1], [1, 0.1, 1]], "camera": {"xyz": [0, 0, 1], "wxyz": [0.5, 0.5, 0.5, 0.5]}}
+SUCKER = {"cylinder": {"center": [0, 0, 0.09], "radius": 0.012, "height": 0.1}}
 EQUIPPED: dict[str, Any] = {
     "base": {"xyz": [0.0, 0.0, 0.7], "wxyz": [1, 0, 0, 0]},
-    "tool": {
-        "link": "panda_hand",
-        "name": "sucker",
-        "xyz": [0, 0, 0.14],
-        "shapes": [{"cylinder": {"center": [0, 0, 0.09], "radius": 0.012, "height": 0.1}}],
-    },
+    "tool": {"link": "panda_hand", "name": "sucker", "xyz": [0, 0, 0.14], "shapes": [SUCKER]},
     "attached": [{"link": "sucker", "box": {"center": [0, 0, 0.06], "size": [0.1, 0.1, 0.1], "name": "parcel"}}],
     "goal": {"pose": {"frame": "parcel", "xyz": [0.45, 0.3, 1.0], "wxyz": [0, 1, 0, 0]}},
     "waypoints": [{"joints": [0.2, -0.785, 0, -2.356, 0, 1.571, 0.785]}],
@@ -45,14 +41,11 @@ CONSTRAINED: dict[str, Any] = {
     ],
     "goal": {"pose": POSE | {"xyz_tolerance": [0.1, 0.1, 0], "rpy_tolerance": [0, 0, 3.1]}},
 }
+POSES = [{"xyz": [0.6, 0, 0.3]}, {"xyz": [0.6, 1, 0.3], "wxyz": [1, 0, 0, 0]}]
 MOVING: dict[str, Any] = {
     "moving": [
         {"sphere": {"center": [0.5, -0.6, 0.5], "radius": 0.1}, "velocity": [0, 0.3, 0]},
-        {
-            "box": {"center": [0.6, 0, 0.3], "size": [0.2, 0.2, 0.2]},
-            "times": [0, 2],
-            "poses": [{"xyz": [0.6, 0, 0.3]}, {"xyz": [0.6, 1, 0.3], "wxyz": [1, 0, 0, 0]}],
-        },
+        {"box": {"center": [0.6, 0, 0.3], "size": [0.2, 0.2, 0.2]}, "times": [0, 2], "poses": POSES},
         {"sphere": {"center": [0.5, 0.6, 0.5], "radius": 0.1, "name": "hand"}, "max_speed": 0.5},
     ]
 }
@@ -68,16 +61,9 @@ CAN = WORLD | {
 }
 MOVEIT = {"name": "", "robot_model_name": "panda", "fixed_frame_transforms": [TABLE], "world": {"collision_objects": [CAN]}}
 JOINTS = [f"panda_joint{i}" for i in range(1, 8)]
-HELD = {
-    "link_name": "panda_hand",
-    "touch_links": ["panda_leftfinger"],
-    "object": {
-        "header": {"frame_id": "panda_hand"},
-        "id": "cup",
-        "primitives": [{"type": 3, "dimensions": [0.2, 0.03]}],
-        "primitive_poses": [{"position": [0, 0, 0.15], "orientation": [0, 0, 0, 1]}],
-    },
-}
+CUP = {"header": {"frame_id": "panda_hand"}, "id": "cup", "primitives": [{"type": 3, "dimensions": [0.2, 0.03]}]}
+CUP |= {"primitive_poses": [{"position": [0, 0, 0.15], "orientation": [0, 0, 0, 1]}]}
+HELD = {"link_name": "panda_hand", "touch_links": ["panda_leftfinger"], "object": CUP}
 REQUEST: dict[str, Any] = {
     "start_state": {"joint_state": {"name": JOINTS, "position": PROBLEM["start"]}},
     "goal_constraints": [
