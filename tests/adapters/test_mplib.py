@@ -96,24 +96,21 @@ def test_a_screw_is_a_straight_line(made: Planner) -> None:
     assert np.allclose(places[-1], end[:3, 3], atol=1e-4)
 
 
-def test_obstacles_and_held_objects_count(made: Planner) -> None:
+def test_obstacles_and_held_objects_count_and_are_removed(made: Planner) -> None:
+    """Regression: `remove_point_cloud("scene_pcd")` and `detach_object("attached_geom")` found nothing, and both stayed."""
     made.update_point_cloud(np.mgrid[-0.1:0.1:5j, -0.1:0.1:5j, -0.1:0.1:5j].reshape(3, -1).T + POSE[:3], resolution=0.03)
     assert made.check_for_env_collision(np.r_[made.workspace.ik(matrix(POSE), near=QPOS[:7])[0], QPOS[7:]])
     assert "collision" in made.plan_pose(POSE, QPOS)["status"]
     assert made.IK(POSE, QPOS)[0].startswith("IK Failed!")
-    assert made.remove_point_cloud() and not made.remove_point_cloud()
+    assert made.remove_point_cloud("scene_pcd") and not made.remove_point_cloud()
     made.update_attached_box([0.05, 0.05, 0.1], [0, 0, 0.15, 1, 0, 0, 0])
     assert [body.name for body in made.workspace.robot.attached] == ["attached_geom"]
     assert made.check_for_self_collision(QPOS) == []
     assert made.plan_pose(POSE, QPOS, planning_time=10.0)["status"] == "Success"
-    assert made.detach_object() and not made.detach_object()
-
-
-def test_clouds_and_held_objects_have_the_names_of_mplib(made: Planner) -> None:
-    """Regression: `remove_point_cloud("scene_pcd")` and `detach_object("attached_geom")` found nothing, and both stayed."""
+    assert made.detach_object("attached_geom") and not made.detach_object()
     made.update_point_cloud(np.array([[2.0, 2.0, 2.0]]))
     made.update_attached_sphere(0.02, [0, 0, 0.15, 1, 0, 0, 0])
-    assert made.remove_point_cloud("scene_pcd") and made.detach_object("attached_geom")
+    assert made.remove_point_cloud() and made.detach_object()
 
 
 def test_an_empty_option_has_no_effect(made: Planner) -> None:

@@ -1,5 +1,4 @@
-"""Exact distances against closed forms, also for the shapes that Coal represents indirectly; grazing links: where the
-convex parts of two links touch, their meshes decide."""
+"""Exact distances against closed forms; grazing links: where the convex parts of two links touch, their meshes decide."""
 
 import errno
 from dataclasses import replace
@@ -42,7 +41,6 @@ def test_box_links_against_a_sphere_in_closed_form(x: float, y: float, z: float,
 
 
 def test_links_without_meshes_are_their_spheres() -> None:
-    """An arm that has one sphere at each link's origin instead of meshes."""
     spheres = {f"l{i}": np.array([[0.0, 0.0, 0.0, 0.04]]) for i in (1, 2, 3)}
     obstacles = [
         rd.Box((0.5, 0.5, 0), (0.2, 0.3, 2)),
@@ -288,7 +286,6 @@ def test_a_folder_without_its_surfaces_is_not_read(tmp_path: Path, monkeypatch: 
 
 
 def test_baxters_torso_and_arms_graze_as_trimesh_finds_too() -> None:
-    """At a sampled configuration in which convex parts of the torso and a link overlap."""
     robot = rd.load_robot("baxter_left")
     q = np.array([-1.5766, -0.088, -0.5168, 1.6863, -2.2078, -0.4002, 1.5902])
     links = ("torso", "left_lower_forearm")

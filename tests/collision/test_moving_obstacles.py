@@ -56,7 +56,6 @@ def as_coal_sees(moves: rd.MovingObstacle, times: np.ndarray, q: np.ndarray) -> 
 
 
 def test_certificate_is_coals_verdict() -> None:
-    """For a motion there and back at constant speed."""
     rng = np.random.default_rng(3)
     times = np.linspace(0.0, 3.0, 3)
     q = np.stack([START, END, START])

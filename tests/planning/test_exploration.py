@@ -1,5 +1,4 @@
-"""Explorer: its motions keep its policy in scenes that it knows only by simulated cameras; and the next view: a pose
-from which nothing hides the space that the motion crosses."""
+"""Explorer: motions keep its policy in scenes known only by simulated cameras; next views, from which nothing hides."""
 
 from dataclasses import replace
 from functools import cache
@@ -112,11 +111,8 @@ def test_nothing_further_than_the_margin_from_a_goal_is_exempt() -> None:
     for low in rng.uniform(MAP.low, (0.8, 0.8, 1.0), size=(300, 3)):
         known.declare_free((tuple(low), tuple(low + rng.uniform(0.03, 0.3, size=3))))
     spheres = PANDA.placed_spheres(HOME)
-    trees = [
-        (KDTree(cloud.points), cloud.point_radius)
-        for cloud in not_seen_free(known, rd.Scene(), RIGHT, (HOME,))
-        if isinstance(cloud, rd.PointCloud)
-    ]
+    clouds = [one for one in not_seen_free(known, rd.Scene(), RIGHT, (HOME,)) if isinstance(one, rd.PointCloud)]
+    trees = [(KDTree(cloud.points), cloud.point_radius) for cloud in clouds]
     trusted = known.free | MAP.filled(PANDA, (RIGHT,), CARVING_MARGIN + MAP.edge / 2)
     outside = 0
     for x, y, z, radius in spheres[rng.integers(len(spheres), size=300)]:

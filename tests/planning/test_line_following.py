@@ -64,12 +64,9 @@ def test_motion_is_on_the_line_at_every_millisecond(name: str) -> None:
         wanted = rotation_about(axis, share * angle) @ T_START[:3, :3]
         assert rotation_angle(wanted.T @ at[:3, :3]) < 2e-4
     # within limits, of which one is used, with few changes of the sign of an acceleration
-    jerks = np.abs(np.diff(t.accelerations, axis=0)) / np.diff(t.times)[:, None]
-    shares = [
-        (np.abs(t.velocities) / PANDA.velocity).max(),
-        (np.abs(t.accelerations) / PANDA.acceleration).max(),
-        (jerks / jerk_limits(PANDA)).max(),
-    ]
+    jerks = np.diff(t.accelerations, axis=0) / np.diff(t.times)[:, None]
+    rates = (t.velocities, PANDA.velocity), (t.accelerations, PANDA.acceleration), (jerks, jerk_limits(PANDA))
+    shares = [(np.abs(rate) / limit).max() for rate, limit in rates]
     assert 0.95 < max(shares) <= 1 + 1e-6
     strong = np.abs(t.accelerations) > 0.05 * np.abs(t.accelerations).max()
     for column, kept in zip(t.accelerations.T, strong.T, strict=True):

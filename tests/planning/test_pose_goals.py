@@ -69,8 +69,7 @@ def test_both_hands_are_brought_to_their_poses() -> None:
 def test_links_that_share_a_joint_are_brought_there_together(tmp_path: Path) -> None:
     """For one arm alone, the waist may have any value; for both hands, it must have one value."""
     arms = (chain("waist_link", row(side, 6)) for side in ("left_", "right_"))
-    parts = chain("base", ["waist"]), *arms
-    robot = read_urdf(written(tmp_path, *parts), group="both")
+    robot = read_urdf(written(tmp_path, chain("base", ["waist"]), *arms), group="both")
     goal = poses_at(robot, np.random.default_rng(1).uniform(0.5 * robot.lower, 0.5 * robot.upper), robot.tips)
     found = pose_configurations(rd.Problem(robot, rd.Scene(), np.zeros(robot.dof), goal), goal, np.random.default_rng(0))
     assert len(found) and max(off(robot, goal, q) for q in found) < 1e-5
@@ -90,12 +89,8 @@ def test_constraints_are_kept_at_the_poses() -> None:
     """The left hand's orientation is free, but its axis must stay within 0.1 rad of upright."""
     start, there = free()[:2]
     down = transform(np.array([0.7, 0.25, 0.4]), np.diag([1.0, -1.0, -1.0]))
-    goal = rd.PosesGoal(
-        [
-            rd.PoseGoal("left_gripper", down, None, [0.4, 0.4, np.pi]),
-            rd.PoseGoal("right_gripper", baxter().fk(there, "right_gripper")),
-        ]
-    )
+    left = rd.PoseGoal("left_gripper", down, None, [0.4, 0.4, np.pi])
+    goal = rd.PosesGoal([left, *poses_at(baxter(), there, HANDS[1:]).poses])
     upright = rd.AxisCone("left_gripper", [0, 0, 1], [0, 0, -1], 0.1)
     problem = rd.Problem(baxter(), rd.Scene(), start, goal, constraints=[upright])
     found = pose_configurations(problem, goal, np.random.default_rng(0))

@@ -46,10 +46,8 @@ def test_poses_are_in_the_world() -> None:
     there.add(ball.moved(T_WORLD_BASE))
     assert np.allclose(there.clearance(START), here.clearance(START))
     assert np.allclose(there.ik(T_WORLD_BASE @ pose, near=GOAL)[0], GOAL, atol=1e-3)
-    one, other = (
-        space.plan(goal, START, time_limit=10.0, planner="aorrtc", until="first")
-        for space, goal in ((here, pose), (there, T_WORLD_BASE @ pose))
-    )
+    asked = (here, pose), (there, T_WORLD_BASE @ pose)
+    one, other = (space.plan(goal, START, time_limit=10.0, planner="aorrtc", until="first") for space, goal in asked)
     assert np.allclose(one.path.positions[-1], other.path.positions[-1], atol=1e-4)
     there.move("ball", T_WORLD_BASE @ rd.pose([0.5, 0.0, 0.6]))
     assert np.allclose(there.scene.shapes[0].bounds, ball.bounds)

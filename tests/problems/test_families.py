@@ -22,6 +22,7 @@ from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.scenes.surface_points import VisibleRegion, sample_surface
 
 PANDA = load_robot("panda")
+BASE = np.array([[0, 0, 0.1, 0.15], [-0.1, 0, 0.05, 0.1]])
 every_family = pytest.mark.parametrize("name", FAMILIES)
 every_target = pytest.mark.parametrize("target", [drawing.CONFIGURATION, *TARGETS])
 
@@ -141,27 +142,28 @@ def test_every_setting_counts() -> None:
 
 def test_obstacles_stay_clear_of_the_base() -> None:
     rng = np.random.default_rng(4)
-    keep_out = np.array([[0, 0, 0.1, 0.15], [-0.1, 0, 0.05, 0.1]])
     settings = replace(ROP, x=(-0.5, 0.5), y=(-0.5, 0.5), yaw=True)
     for _ in range(100):
-        for shape in settings.scene(rng, keep_out).shapes[1:]:  # without the floor
+        for shape in settings.scene(rng, BASE).shapes[1:]:  # without the floor
             points = sample_surface(Scene([shape]), 200, rng, VisibleRegion(floor=-5.0, reach=9.0))
-            gaps = np.linalg.norm(points[:, None] - keep_out[:, :3], axis=2) - keep_out[:, 3]
+            gaps = np.linalg.norm(points[:, None] - BASE[:, :3], axis=2) - BASE[:, 3]
             assert gaps.min() > 0
-            assert isinstance(shape, Sphere | Box) and np.linalg.norm(shape.center - keep_out[0, :3]) > 0.15
-    refuses("widen", replace(ROP, x=(0.0, 0.0), y=(0.0, 0.0), z=(0.1, 0.1)).scene, rng, keep_out)
+            assert isinstance(shape, Sphere | Box) and np.linalg.norm(shape.center - BASE[0, :3]) > 0.15
+    refuses("widen", replace(ROP, x=(0.0, 0.0), y=(0.0, 0.0), z=(0.1, 0.1)).scene, rng, BASE)
 
 
 def test_wrong_settings_and_impossible_problems(monkeypatch: pytest.MonkeyPatch) -> None:
     refuses("'cone'; known: box, sphere", replace, ROP, kinds=("sphere", "cone"))
     refuses("obstacles is from 3 to 2", replace, ROP, obstacles=(3, 2))
     refuses("must not be empty", replace, ROP, kinds=())
+    refuses(r"boards\[0\] is 1; it must be at least 2", replace, furniture.SHELF, boards=(1, 3))
+    refuses(r"thickness\[0\] is 0.0; it must be positive", replace, furniture.CRATE, thickness=(0.0, 0.02))
+    refuses("wall_share is 0.8 and pillar_share 0.3", replace, furniture.TABLE, wall_share=0.8)
     monkeypatch.setattr(drawing, "MAX_SCENES", 2)
     far = replace(ROP, tip_z=(5.0, 6.0))
     refuses("no free start and goal in 2 scenes of Rop for panda", far.draw, PANDA, np.random.default_rng(10))
 
 
-BASE = np.array([[0, 0, 0.1, 0.15], [-0.1, 0, 0.05, 0.1]])
 NAMES = ("shelf", "crate", "table", "clutter", "kitchen", "cabinet")
 FURNITURE: dict[str, furniture.Furniture] = {name: getattr(furniture, name.upper()) for name in NAMES}
 every_piece = pytest.mark.parametrize("name", FURNITURE)
@@ -226,12 +228,6 @@ def test_targets_have_the_fingers_in_the_region() -> None:
     assert cosines.min() > least - 1e-12
     # uniform on the cap: the cosine is uniform; mean of 1000 draws within five standard deviations
     assert abs(cosines.mean() - (1 + least) / 2) < 5 * (1 - least) / np.sqrt(12 * 1000)
-
-
-def test_wrong_settings() -> None:
-    refuses(r"boards\[0\] is 1; it must be at least 2", replace, furniture.SHELF, boards=(1, 3))
-    refuses(r"thickness\[0\] is 0.0; it must be positive", replace, furniture.CRATE, thickness=(0.0, 0.02))
-    refuses("wall_share is 0.8 and pillar_share 0.3", replace, furniture.TABLE, wall_share=0.8)
 
 
 @every_piece

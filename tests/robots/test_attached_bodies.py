@@ -23,15 +23,13 @@ from robotdiffuse.scenes.surface_points import draw
 
 rng = np.random.default_rng(0)
 CLOUD = rng.normal(size=(40, 3)) * [0.05, 0.03, 0.1]
+STICK = box_mesh(np.zeros(3), np.array([0.3, 0.02, 0.02]))
 SOLIDS = {
     "cube": box_mesh(np.full(3, -0.02), np.full(3, 0.02)),
     "box": box_mesh(np.array([-0.03, -0.03, -0.1]), np.array([0.03, 0.03, 0.1])),
     "tray": box_mesh(np.array([-0.2, -0.15, -0.005]), np.array([0.2, 0.15, 0.005])),
     "stone": convex_hull(CLOUD),
-    "tilted": convex_hull(
-        box_mesh(np.zeros(3), np.array([0.3, 0.02, 0.02])).vertices
-        @ rotation_about(np.array([1.0, 2.0, 3.0]) / np.sqrt(14), 0.7)
-    ),
+    "tilted": convex_hull(STICK.vertices @ rotation_about(np.array([1.0, 2.0, 3.0]) / np.sqrt(14), 0.7)),
 }
 SHAPES = [
     rd.Sphere([0.1, 0.0, 0.05], 0.03, name="ball"),

@@ -269,12 +269,9 @@ def toppra_speeds(line: RoundedLine, grid: np.ndarray, velocity: np.ndarray, acc
         def __call__(self, path_positions: np.ndarray | float, order: int = 0) -> np.ndarray:
             return line(np.atleast_1d(np.asarray(path_positions, dtype=np.float64)), order)
 
-    constraints = [
-        toppra.constraint.JointVelocityConstraint(velocity),
-        toppra.constraint.JointAccelerationConstraint(
-            acceleration, discretization_scheme=toppra.constraint.DiscretizationType.Interpolation
-        ),
-    ]
+    kinds = toppra.constraint
+    most = kinds.JointAccelerationConstraint(acceleration, discretization_scheme=kinds.DiscretizationType.Interpolation)
+    constraints = [kinds.JointVelocityConstraint(velocity), most]
     algorithm = toppra.algorithm.TOPPRA(constraints, Geometry(), gridpoints=grid, solver_wrapper="seidel")
     return algorithm.compute_parameterization(0.0, 0.0)[1]
 
