@@ -19,7 +19,7 @@ from helpers.refusals import refuses
 from helpers.sphere_oracles import distance
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.scenes.files import SHAPES as KINDS, read_scene, scene_entries
-from robotdiffuse.scenes.point_cloud import distinct, lzf_unpacked, read_points, voxel_thin
+from robotdiffuse.scenes.point_cloud import crop, distinct, lzf_unpacked, read_points, voxel_thin
 from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.scenes.surface_points import VisibleRegion, draw, sample_surface
 
@@ -153,8 +153,10 @@ def test_thinning_keeps_one_point_of_each_cell(rows: list[tuple[float, float, fl
         assert (gap[(points[:, None] == kept).all(axis=2).any(axis=1)] == 0).all()
 
 
-def test_thinning_of_points_far_apart() -> None:
+def test_thinning_of_points_far_apart_and_crop() -> None:
     assert len(voxel_thin(np.array([[-1e9, 0, 0], [1e9, 5e8, 1e9], [1e9, 5e8, 1e9], [0, 0, 0]]), 1e-3)) == 3
+    row = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
+    assert (crop(row, np.array([1.0, 0, 0]), 1.0) == row[:2]).all()
 
 
 POINTS = np.random.default_rng(7).uniform(-1, 1, (50, 3)).astype(np.float32).astype(np.float64)

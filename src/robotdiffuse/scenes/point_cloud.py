@@ -20,7 +20,7 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, reading, shown
 from robotdiffuse.core.input_files import input_file, known_ending, read_array, read_bytes
 from robotdiffuse.core.mesh_files import check_ply
-from robotdiffuse.core.types import Points
+from robotdiffuse.core.types import Points, Vector
 
 FIRST_LINE = b"# Octomap OcTree binary file"
 TREE_DEPTH = 16
@@ -156,6 +156,11 @@ def distinct(points: Points) -> Points:
     first = np.ones(len(points), bool)
     first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
     return points if first.all() else points[np.sort(order[first])]
+
+
+def crop(points: Points, center: Vector, reach: float) -> Points:
+    """The points within `reach` of `center` [m]."""
+    return points[((points - center) ** 2).sum(axis=1) <= reach**2]
 
 
 def read_points(file: str | Path) -> tuple[Points, tuple[str, ...]]:
