@@ -148,8 +148,14 @@ DAMAGE = [
     (r"shard .*shard_00000\.zarr is damaged", lambda store: about(store, "").write_text("{")),
     ("is damaged: its arrays have unequal numbers of rows", rewrite("detour", lambda a: a[:-1])),
     ("array detour is <f8 with 1 axes; it must be <f4 with 1", rewrite("detour", lambda a: a.astype(np.float64))),
-    (r"obstacle_params has rows of shape \(4, 9\); .* says \(4, 10\)", rewrite("obstacle_params", lambda a: a[..., :9])),
-    ("its fingerprint is not that of its arrays", change_bytes("trajectories", lambda a: a[:50] + bytes([a[50] ^ 1]) + a[51:])),
+    (
+        r"array obstacle_params has rows of shape \(4, 9\); the manifest says \(4, 10\)",
+        rewrite("obstacle_params", lambda a: a[..., :9]),
+    ),
+    (
+        "is damaged: its fingerprint is not that of its arrays",
+        change_bytes("trajectories", lambda a: a[:50] + bytes([a[50] ^ 1]) + a[51:]),
+    ),
     ("format is 2; this version reads 1", relabel(format=2)),
     ("is damaged: its attributes are not those of shard 0", relabel(index=4)),
     ("array seed is damaged", describe(shape=[10**30])),

@@ -87,9 +87,14 @@ def test_depth_files(tmp_path: Path) -> None:
     (tmp_path / "bad.png").write_bytes(b"no image")
     with ZipFile(tmp_path / "text.npz", "w") as archive:
         archive.writestr("notes.txt", "none")
-    wrong = {"gray.png": "grayscale with 16 bits", "color.npy": "holds float64 of 4 x 4 x 3", "bad.png": "is damaged"}
-    wrong |= {"none.png": "does not exist", "a.jpg": "unknown depth image format"}
-    for name, message in (wrong | {"text.npz": "notes.txt is b'none'; it must be an array"}).items():
+    for name, message in {
+        "gray.png": "grayscale with 16 bits",
+        "color.npy": "holds float64 of 4 x 4 x 3",
+        "bad.png": "is damaged",
+        "text.npz": "notes.txt is b'none'; it must be an array",
+        "none.png": "does not exist",
+        "a.jpg": "unknown depth image format",
+    }.items():
         refuses(message, read_depth, tmp_path / name)
     # integers of 65535 are no returns
     Image.fromarray(np.array([[1000, 65535]], np.uint16)).save(tmp_path / "a.png")

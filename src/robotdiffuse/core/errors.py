@@ -166,8 +166,9 @@ def repeated(names: Iterable[str]) -> list[str]:
 def unknown_name(what: str, name: object, known: Iterable[object]) -> InputError:
     """An InputError for a name that is not in a table; it lists the known names."""
     names = sorted(map(str, known))
-    listed = joined(names) or "none"
-    return InputError(f"unknown {what} {shown(name)}; known: {listed}{suggestion(name, names)}")
+    return InputError(
+        f"unknown {what} {shown(name)}; known: {joined(names) or 'none'}{suggestion(name, names)}"
+    )
 
 
 def check_name(what: str, name: object, known: Collection[object]) -> None:
@@ -207,7 +208,7 @@ RIGID_SLACK = 1e-4
 """Largest allowed error of a pose matrix: of each entry of R R^T against the identity, and of each entry of
 the last row against LAST_ROW."""
 MOTION_SLACK = 1e-3
-"""Largest allowed error of the matrix of a rigid motion, often a product of poses; see RIGID_SLACK."""
+"""Like RIGID_SLACK, for motions, which are often products of poses."""
 LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -330,6 +331,11 @@ def rigid_transform(what: str, value: object, slack: float = RIGID_SLACK) -> nda
         )
     T[3] = LAST_ROW
     return T
+
+
+def rigid_motion(T: object) -> ndarray:
+    """The argument `T` of a method `moved`, a rigid motion. Raises InputError as `rigid_transform` does."""
+    return rigid_transform("T", T, MOTION_SLACK)
 
 
 def form(array: ndarray | None) -> str:

@@ -300,13 +300,18 @@ MIN_RETURN_SHARE = 1e-3
 faces nothing."""
 
 
-def measured_share(view: DepthView) -> float:
-    """The fraction of an image's pixels that measure a surface, or show that nothing is in range. 0 if fewer
-    than MIN_RETURN_SHARE measure a surface."""
+def shows_surface(view: DepthView) -> bool:
+    """Whether at least MIN_RETURN_SHARE of an image's pixels measure a surface."""
     depth = filtered(view).depth
-    measured = depth >= NEAREST
-    if (measured & np.isfinite(depth)).mean() < MIN_RETURN_SHARE:
+    return bool(((depth >= NEAREST) & np.isfinite(depth)).mean() >= MIN_RETURN_SHARE)
+
+
+def measured_share(view: DepthView) -> float:
+    """The fraction of an image's pixels that measure a surface, or show that nothing is in range; 0 for an
+    image without a surface."""
+    if not shows_surface(view):
         return 0.0
+    measured = filtered(view).depth >= NEAREST
     empty = None if view.range is None else empty_regions(view.depth, view.range)
     return float((measured if empty is None else measured | empty).mean())
 

@@ -18,12 +18,12 @@ from numpy.typing import ArrayLike
 from robotdiffuse.core.errors import (
     MAX_COORDINATE,
     MAX_RATE,
-    MOTION_SLACK,
     InputError,
     check_type,
     form,
     numbers,
     positive,
+    rigid_motion,
     rigid_transform,
     rows,
     shown,
@@ -156,9 +156,9 @@ class DepthView(Value):
             The view after the motion.
 
         Raises:
-            InputError: If T is not a rigid motion.
+            InputError: Unless T is rigid.
         """
-        T = rigid_transform("T", T, MOTION_SLACK)
+        T = rigid_motion(T)
         cloud = None if self.cloud is None else placed(T, self.cloud)
         return replace(self, T_base_camera=T @ self.T_base_camera, cloud=cloud)
 

@@ -19,8 +19,8 @@ from robotdiffuse.perception.depth_filter import (
     empty_regions,
     filtered,
     grown_for_errors,
-    measured_share,
     open_depth,
+    shows_surface,
 )
 from robotdiffuse.perception.depth_view import NEAREST, DepthView
 from robotdiffuse.perception.ray_caster import balls, in_camera, rectangle, render_depth
@@ -568,8 +568,8 @@ def observed_by(view: DepthView, robot: Robot, start: Configuration) -> Observed
     state, behind, counts = carve_view(view, robot, q, COARSE)
     occupied = counts > 0
     behind[(state != BEHIND) | occupied] = 0.0
-    measured = measured_share(view) > 0
-    free, shadow, lost = ((state == kind) & ~occupied & measured for kind in (FREE, SHADOW, LOST))
+    usable = shows_surface(view)
+    free, shadow, lost = ((state == kind) & ~occupied & usable for kind in (FREE, SHADOW, LOST))
     return ObservedVolume(occupied, free, shadow, state == OUT, behind, lost)
 
 

@@ -119,7 +119,8 @@ LOST_PROBABILITY = 0.15
 
 def lost_regions(volume: ObservedVolume) -> Voxels:
     """The fine voxels that were lost in regions at least LOST_WIDTH wide."""
-    return refined(wide_regions(volume.lost, LOST_WIDTH))
+    lost = volume.lost
+    return refined(wide_regions(lost, LOST_WIDTH) if lost.any() else lost)
 
 
 class UnknownSpace:
@@ -140,7 +141,7 @@ class UnknownSpace:
         unknown: the voxels of the grid that no view saw.
         predicted: the probability that each voxel is occupied; None without a prediction.
         margin: voxels nearer to the arm at these configurations than this count as occupied by it [m].
-        lost: voxels on rays without a return, see `lost_regions`.
+        lost: see `lost_regions`; only confidences without a prediction depend on it.
         """
         self._robot = robot
         self._grid = grid
@@ -167,7 +168,7 @@ class CrossedSpace:
     """Predicted probability that each voxel is occupied; None without a prediction."""
     grid: VoxelGrid = FINE
     lost_share: float = 0.0
-    """Fraction of the voxels on the motion that are unknown because their rays have no return."""
+    """Fraction of the voxels on the motion that are in lost regions."""
     unseen_share: float = 0.0
     """Fraction of the voxels on the motion that no view saw."""
 

@@ -11,7 +11,15 @@ from typing import Any, ClassVar, TypeVar, get_args
 
 import numpy as np
 
-from robotdiffuse.core.errors import MAX_COORDINATE, InputError, numbers, rigid_transform, shown, vector
+from robotdiffuse.core.errors import (
+    MAX_COORDINATE,
+    InputError,
+    numbers,
+    rigid_motion,
+    rigid_transform,
+    shown,
+    vector,
+)
 from robotdiffuse.core.types import (
     GivenVector,
     Pose,
@@ -76,7 +84,8 @@ class FrameConstraint(Value):
             object.__setattr__(self, name, read_only(content))
 
     def moved(self: Self, T: Pose) -> Self:
-        """The constraint after the rigid motion T."""
+        """The constraint after the rigid motion T. Raises InputError unless T is rigid."""
+        T = rigid_motion(T)
         after: dict[str, Any] = {}
         for name in ("direction", "normal", "point", "T_base_box"):
             if hasattr(self, name):

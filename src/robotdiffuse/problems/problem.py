@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 from robotdiffuse.core.errors import (
     MAX_COORDINATE,
     MIN_RATE,
-    MOTION_SLACK,
     InputError,
     check_list,
     check_name,
@@ -28,6 +27,7 @@ from robotdiffuse.core.errors import (
     distinct,
     numbers,
     repeated,
+    rigid_motion,
     rigid_transform,
     short,
     shown,
@@ -137,9 +137,9 @@ class PoseGoal(Value):
             The goal after the motion.
 
         Raises:
-            InputError: If T is not a rigid motion.
+            InputError: Unless T is rigid.
         """
-        T = rigid_transform("T", T, MOTION_SLACK)
+        T = rigid_motion(T)
         return replace(self, T_base_frame=T @ self.T_base_frame)
 
     @property

@@ -11,12 +11,12 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import (
-    MOTION_SLACK,
     InputError,
     distinct,
     form,
     located,
     numbers,
+    rigid_motion,
     rigid_transform,
     shown,
     vector,
@@ -234,7 +234,7 @@ class MovingObstacle(Value):
         Raises:
             InputError: Unless T is rigid.
         """
-        T = rigid_transform("T", T, MOTION_SLACK)
+        T = rigid_motion(T)
         velocity = None if self.velocity is None else T[:3, :3] @ self.velocity
         poses = None if self.poses is None else T @ self.poses
         return replace(self, shape=self.shape.moved(T), velocity=velocity, poses=poses)

@@ -25,6 +25,8 @@ PLANE_SIZE = 10.0
 """Smallest edge of the box that stands for a plane [m]."""
 PLANE_DEPTH = 0.1
 """Thickness of the boxes that stand for planes [m]."""
+MOVED = 1e-4
+"""A larger change [m or rad] of a joint that places a MuJoCo robot counts as a motion of the robot."""
 
 
 @no_type_check
@@ -94,8 +96,8 @@ class Scene(Value):
                 reads from a model has the base "world".
 
         Returns:
-            The scene. A plane, which is infinite in MuJoCo whatever its size, becomes a box with edges of at
-            least 10 m around the base. Meshes are replaced by their convex hulls, as MuJoCo does.
+            The scene. A plane, which collides without end in MuJoCo, becomes a box with edges of at least
+            10 m around the base. Meshes are replaced by their convex hulls, as MuJoCo does.
 
         Raises:
             InputError: For an unknown body, for soft bodies, height fields and signed distance fields, and if
@@ -261,14 +263,15 @@ def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
     check_name("body", base, bodies)
     base_body = bodies.index(base)
     robot_bodies = mjcf.robot_bodies(model)
-    placing = np.isin(model.dof_jntid, [*mjcf.placing_joints(model, robot_bodies)])
-    change = np.zeros(model.nv)
-    mujoco.mj_differentiatePos(model, change, 1.0, model.qpos0, placed.qpos)
-    if base == "world" and (np.abs(change[placing]) > 1e-4).any():  # [m] or [rad]
-        raise InputError(
-            "data moves the robot, which is held where the model places it; take a body that moves with it "
-            "as the base, here by base=BODY and in `robot add` by --base BODY"
-        )
+    if base == "world":
+        placing = np.isin(model.dof_jntid, [*mjcf.placing_joints(model, robot_bodies)])
+        change = np.zeros(model.nv)
+        mujoco.mj_differentiatePos(model, change, 1.0, model.qpos0, placed.qpos)
+        if (np.abs(change[placing]) > MOVED).any():
+            raise InputError(
+                "data moves the robot, which is held where the model places it; take a body that moves with "
+                "it as the base, here by base=BODY and in `robot add` by --base BODY"
+            )
     T_base_world = inverse(transform(placed.xpos[base_body], placed.xmat[base_body].reshape(3, 3)))
     colliding = mjcf.colliding_geoms(model)
     shapes: list[Shape] = []

@@ -20,13 +20,12 @@ from numpy.typing import ArrayLike
 from robotdiffuse.core.errors import (
     MAX_COORDINATE,
     MIN_SIZE,
-    MOTION_SLACK,
     InputError,
     form,
     numbers,
     points,
     positive,
-    rigid_transform,
+    rigid_motion,
     shown,
     unit_quaternion,
     vector,
@@ -203,7 +202,7 @@ class Sphere(Shape):
         Raises:
             InputError: Unless T is rigid.
         """
-        T = rigid_transform("T", T, MOTION_SLACK)
+        T = rigid_motion(T)
         return replace(self, center=T[:3, :3] @ self.center + T[:3, 3])
 
 
@@ -223,7 +222,7 @@ class _Posed(Shape):
         return transform(getattr(self, self.origin), self.rotation)
 
     def moved(self, T: Pose) -> "Shape":
-        T = rigid_transform("T", T, MOTION_SLACK) @ self.T_base_shape
+        T = rigid_motion(T) @ self.T_base_shape
         moved: dict[str, Any] = {self.origin: T[:3, 3], "wxyz": quaternion_from_rotation(T[:3, :3])}
         return replace(self, **moved)  # type: ignore[type-var]
 
@@ -411,7 +410,7 @@ class PointCloud(Shape):
         Raises:
             InputError: Unless T is rigid.
         """
-        return replace(self, points=placed(rigid_transform("T", T, MOTION_SLACK), self.points), file=None)
+        return replace(self, points=placed(rigid_motion(T), self.points), file=None)
 
 
 class Triangulated(Shape):

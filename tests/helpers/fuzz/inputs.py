@@ -232,10 +232,23 @@ def _urdf(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
 
 
 def _result(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
-    record: dict[str, Any] = {"status": "solved", "reason": "solved by hand", "planner": "hand", "robot": "panda"}
-    record |= {"joint_names": examples.JOINTS, "planning_time": 0.1, "verified": True, "seed": 0, "waypoints": examples.ROWS}
-    record |= {"times": [0.0, 1.0, 2.0], "positions": examples.ROWS, "velocities": [[0.0] * 7, [0.3] + [0.0] * 6, [0.0] * 7]}
-    record |= {"accelerations": [[0.0] * 7] * 3, "progress": [[0.1, 0.4]], "problem": examples.SMALL}
+    record = {
+        "status": "solved",
+        "reason": "solved by hand",
+        "planner": "hand",
+        "robot": "panda",
+        "joint_names": examples.JOINTS,
+        "planning_time": 0.1,
+        "verified": True,
+        "seed": 0,
+        "waypoints": examples.ROWS,
+        "times": [0.0, 1.0, 2.0],
+        "positions": examples.ROWS,
+        "velocities": [[0.0] * 7, [0.3] + [0.0] * 6, [0.0] * 7],
+        "accelerations": [[0.0] * 7] * 3,
+        "progress": [[0.1, 0.4]],
+        "problem": examples.SMALL,
+    }
     file = folder / "result.json"
     file.write_bytes(text_of(rng, record, ".json"))
 

@@ -537,7 +537,9 @@ class Explorer:
 
     def _unknown(self, ends: Iterable[Configuration], predicted: Probabilities | None) -> UnknownSpace:
         """The unknown voxels of the map, except voxels that the arm fills at the configurations `ends`."""
-        lost = np.pad(lost_regions(self._views.volume()), ((0, 0), (0, 0), (LAYERS_BELOW, 0)))
+        lost = None
+        if predicted is None:
+            lost = np.pad(lost_regions(self._views.volume()), ((0, 0), (0, 0), (LAYERS_BELOW, 0)))
         return UnknownSpace(self.robot, ends, self.map.unknown, predicted, 0.0, MAP, lost)
 
     def _planned(self, problem: Problem, limit: float, seed: int | None = None) -> PlanResult:

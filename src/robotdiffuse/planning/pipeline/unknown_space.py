@@ -119,11 +119,13 @@ def plan_with_unknown_space(
             " the depths, with their scale, not in meters?"
         )
         return _with_notes(context, context.fail(Status.NO_PATH, why))
-    for i, (wrong, seen, share) in enumerate(zip(cameras, volumes, shares, strict=False)):
+    for i, wrong in enumerate(cameras):
         if wrong:
             context.note(f"check the camera of views[{i}]: {wrong}")
+    for i, seen in enumerate(volumes):
         if seen.unknown.all():
             context.note(f"views[{i}] shows nothing of the space around the arm: check its T_base_camera")
+    for i, share in enumerate(shares):
         if share < NOTED_SHARE:
             remedy = "; if the sensor gives 0 where nothing is in range, state the view's range"
             context.note(
@@ -223,7 +225,8 @@ def unknown_space_of(
     goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
     ends = (problem.start, *goals)
     unknown = refined(volume.unknown)
-    return UnknownSpace(problem.robot, ends, unknown, predicted, lost=lost_regions(volume))
+    lost = lost_regions(volume) if predicted is None else None
+    return UnknownSpace(problem.robot, ends, unknown, predicted, lost=lost)
 
 
 def predicted_obstacles(problem: Problem) -> AssumedPoints:

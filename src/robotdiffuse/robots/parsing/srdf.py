@@ -171,7 +171,7 @@ ALL = "all"
 """Name of the group of all arms, for any number of arms from two on."""
 FINGER = re.compile("finger|fngr|jaw|claw|knuckle|thumb", re.IGNORECASE)
 """Matches names of links that are moved by the last joint of an arm with at least MIN_ARM_JOINTS other
-joints. This joint then counts as a gripper joint, whatever its name."""
+joints. This joint then counts as a gripper joint, under any name."""
 SUFFIX_CHARACTERS = "_-/0123456789 "
 """Characters stripped from the end of the common prefix of an arm's joint names."""
 MAX_FINGER_JOINTS = 2

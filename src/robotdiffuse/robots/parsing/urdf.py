@@ -587,9 +587,9 @@ class UrdfTree:
             )
         return Surface(vertices, faces)
 
-    def _numbers(self, text: str, count: int, what: str, most: float = MAX_COORDINATE) -> Values:
+    def _numbers(self, text: str, count: int, what: str) -> Values:
         """The `count` numbers of an attribute. Raises InputError for another number of values, and for values
-        that are not finite or not within ±`most`."""
+        that are not finite or not within ±MAX_COORDINATE."""
         try:
             values = np.array([float(word) for word in text.split()])
         except ValueError:
@@ -597,8 +597,8 @@ class UrdfTree:
         if len(values) != count or not np.isfinite(values).all():
             expected = "a finite number" if count == 1 else f"{count} finite numbers"
             raise InputError(f"{self.path}: {what} is {shown(text)}; it must be {expected}")
-        if not within(values, most):
-            raise InputError(f"{self.path}: {what} is {shown(text)}; it must be within ±{most:g}")
+        if not within(values):
+            raise InputError(f"{self.path}: {what} is {shown(text)}; it must be within ±{MAX_COORDINATE:g}")
         return values
 
     def _origin(self, element: ET.Element, what: str) -> Pose:
