@@ -182,7 +182,7 @@ def test_a_plan_by_search_loads_what_it_needs_and_no_more(tmp_path: Path) -> Non
         "import sys\nfrom robotdiffuse import cli\nfrom robotdiffuse.cli import console\n"
         "console.SPINNER_DELAY = 600.0\n"
         f"assert cli.main(['plan', {str(problem)!r}, '--planner', 'aorrtc', '--time-limit', '60']) == 0\n"
-        "unwanted = ('torch', 'toppra', 'trimesh', 'rich', 'scipy.linalg', 'scipy.spatial')\n"
+        "unwanted = ('torch', 'coal', 'toppra', 'trimesh', 'rich', 'scipy.linalg', 'scipy.spatial')\n"
         "own = 'planning.search.constrained', 'planning.pose_goals', 'problems.compiled_constraints'\n"
         "unwanted += tuple(f'robotdiffuse.{name}' for name in own)\n"
         "print([name for name in unwanted if name in sys.modules])"

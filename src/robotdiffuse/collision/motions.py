@@ -1,12 +1,12 @@
 """Collision of motions: the arguments of compiled searches, and the motion certificate of the validator.
 
 The motion certificate proves that a whole motion is free of collision, not only its waypoints, or finds its
-first contact, or all of its contacts. A piece of the motion is free for a link if a lower bound of the link's
-clearance along the piece is positive; otherwise the piece is split. The bound is computed from the clearance
-in the middle of the piece, the link's velocity there towards the nearest bodies, and a bound on the curvature
-of the motion (`kernels/motion_certificate.py`). For two links, motion is measured relative to the link nearer
-to the base (on two arms: to the frame where the arms part), so only the joints between the links contribute.
-Clearances are first computed from the covering spheres, for many configurations at once
+first contact; `contacts` finds the later ones too. A piece of the motion is free for a link if a lower bound
+of the link's clearance along the piece is positive; otherwise the piece is split. The bound is computed from
+the clearance in the middle of the piece, the link's velocity there towards the nearest bodies, and a bound on
+the curvature of the motion (`kernels/motion_certificate.py`). For two links, motion is measured relative to
+the link nearer to the base (on two arms: to the frame where the arms part), so only the joints between the
+links contribute. Clearances are first computed from the covering spheres, for many configurations at once
 (`kernels/lane_clearance.py`). Where the spheres are too coarse, separating planes between the convex meshes
 give the bound (`kernels/convex_bounds.py`). Coal computes distances to surfaces and point clouds, and decides
 whether bodies touch."""
@@ -28,7 +28,6 @@ from robotdiffuse.collision.convex_geometry import (
     solid_arrays,
     surfaces_decide,
 )
-from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernel_arrays import compile_robot, compile_scene_for, robot_groups
 from robotdiffuse.collision.kernels import motion_certificate as kernel
 from robotdiffuse.collision.kernels import motion_pieces
@@ -92,8 +91,8 @@ def search_space(
 
 
 def finer_resolution(resolution: float) -> float:
-    """Half the resolution, at least FINEST_RESOLUTION [m]: for the next search after the validator found a
-    contact between two configurations that a search had checked."""
+    """Half the resolution, at least FINEST_RESOLUTION [m]: for the next search, after the validator found a
+    contact that the last search had missed between two configurations."""
     return max(resolution / 2, FINEST_RESOLUTION)
 
 
@@ -229,10 +228,7 @@ class ContinuousCollision:
         separated = [i for i, name in enumerate(names) if name != partner or distances[i] > self.contact]
         episode = distances[: separated[0] if separated else len(steps)]
         depth = max(0.0, -float(episode.min(initial=0)))
-        waypoint, share = motion_pieces.segment_at(motion.travel, at)
-        if share == 0.0:  # the first of several equal waypoints
-            waypoint = int(np.searchsorted(motion.travel, at))
-        return Contact(checks_of(self.robot)[check], str(partner), waypoint + share, depth)
+        return Contact(checks_of(self.robot)[check], str(partner), _place(motion, at), depth)
 
 
 @once_per_robot
@@ -324,12 +320,12 @@ MAX_SWEEPS = 5000
 def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: float) -> list[Contact]:
     """All contacts along straight lines through waypoints, in order.
 
-    A contact begins where two bodies come nearer than `contact` [m] and lasts until they separate. The motion
-    certificate stops at the first place that it cannot prove free: the next contact. From there, exact
-    distances are computed every 1 cm of motion until no bodies are in contact.
+    A contact begins where two bodies come nearer than `contact` [m] and lasts until they separate. If a link
+    touches several obstacles at once, only the deepest contact counts. The motion certificate stops at the
+    first place that it cannot prove free: the next contact. From there, exact distances are computed every
+    1 cm of motion until no bodies are in contact.
     """
     validator = ContinuousCollision(robot, scene, contact, 0.5)
-    exact = ExactCollision(robot, scene)
     motion = Motion(for_kernels(q), motion_pieces.travel_along(q, validator.checks.motion_radii))
     end = float(motion.travel[-1])
     at = 0.0
@@ -345,14 +341,14 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
         # motion
         travel = np.concatenate([[at], motion.travel[low + 1 :]])
         at = float(np.interp(first.at, np.arange(len(travel)), travel))
-        at = _follow(exact, motion, at, contact, first, contacts_in_order)
+        at = _follow(validator._exact, motion, at, contact, first, contacts_in_order)
         if at >= end:
             break
     return contacts_in_order
 
 
 def _follow(
-    exact: ExactCollision,
+    exact: "ExactCollision",
     motion: Motion,
     at: float,
     contact: float,
@@ -364,13 +360,14 @@ def _follow(
     open_contacts = {(first.check, first.other): len(contact_list)}
     contact_list.append(first._replace(at=_place(motion, at)))
     count = len(exact.checks)
+    begin = at
     end = float(motion.travel[-1])
-    while at < end:
-        at = min(at + DEPTH_SAMPLE_TRAVEL, end)
+    while True:
         q = motion_pieces.configurations(motion, np.full(count, at))
         distances, names = exact.nearest(q, np.arange(count), np.full(count, np.inf))
         touching = {(exact.checks[i], str(names[i])): i for i in np.flatnonzero(distances <= contact)}
-        open_contacts = {key: k for key, k in open_contacts.items() if key in touching}
+        if at > begin:
+            open_contacts = {key: k for key, k in open_contacts.items() if key in touching}
         for key, i in touching.items():
             depth = max(0.0, -float(distances[i]))
             if key in open_contacts:
@@ -379,12 +376,13 @@ def _follow(
             else:
                 open_contacts[key] = len(contact_list)
                 contact_list.append(Contact(*key, _place(motion, at), depth))
-        if not touching:
+        if at >= end or (at > begin and not touching):
             return at
-    return end
+        at = min(at + DEPTH_SAMPLE_TRAVEL, end)
 
 
 def _place(motion: Motion, at: float) -> float:
-    """The waypoint index plus the fraction of the segment at travel `at`."""
+    """The waypoint index plus the fraction of the segment at travel `at`; the first of several equal
+    waypoints."""
     low, share = motion_pieces.segment_at(motion.travel, at)
-    return low + share
+    return low + share if share > 0 else float(np.searchsorted(motion.travel, at))

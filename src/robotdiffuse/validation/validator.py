@@ -510,9 +510,10 @@ def violations(
 ) -> tuple[Violation, ...]:
     """All violations of a motion in the order of their places; empty if it is valid.
 
-    They include every contact with static obstacles and between links, at the place where it begins; joint
-    limits once for each joint; and the first violation of every other kind, also the first contact with a
-    moving obstacle. If numbers are not finite, or times are not those of a motion, only this is returned.
+    They include every contact with static obstacles and between links, at the place where it begins (only the
+    deepest if a link touches several obstacles at once); joint limits once for each joint; and the first
+    violation of every other kind, also the first contact with a moving obstacle. If numbers are not finite,
+    or times are not those of a motion, only this is returned.
     """
     from robotdiffuse.collision.motions import contacts  # imported here, since nothing else needs it
 
