@@ -271,8 +271,8 @@ def test_joined_motions_keep_the_limits_of_the_call() -> None:
         assert (motion.peak_jerks <= 80.0 * (1 + 1e-6)).all()
 
 
-def test_motions_with_other_payloads_or_moving_obstacles_are_not_joined() -> None:
-    """Regression: those of the first motion counted for all."""
+def test_motions_with_other_payloads_or_moving_obstacles_or_from_a_velocity_are_not_joined() -> None:
+    """Regression: payload and obstacles of the first motion counted for all; for a velocity, accelerations were blamed."""
     scene, end = rd.Scene(), [0.6, 0.2, 0, -1.8, 0, 2.2, 0.2]
     cart = rd.MovingObstacle(rd.Sphere([3.0, 0.0, 0.5], 0.1, "cart"), velocity=[0.1, 0.0, 0.0])
 
@@ -283,4 +283,6 @@ def test_motions_with_other_payloads_or_moving_obstacles_are_not_joined() -> Non
     back = planned(end, "ready", payload=rd.Payload(1.0, [0, 0, 0.1]))
     for other in (back, planned(end, "ready", moving=[cart])):
         refuses("another robot, scene or payload", rd.join, [there, other])
+    moving = planned(end, "ready", start_velocity=[0.1, 0, 0, 0, 0, 0, 0])
+    refuses(r"results\[1\] has a start_velocity; it must begin at rest", rd.join, [there, moving])
     assert rd.join([loaded, back]).problem.payload is not None

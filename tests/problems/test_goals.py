@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import robotdiffuse as rd
 from helpers.commands import written
 from helpers.refusals import refuses
 from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
+from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.validation.tolerances import goal_error
 from robotdiffuse.validation.validator import verify_trajectory
@@ -136,6 +138,15 @@ def test_the_leg_that_fails_is_named() -> None:
     blocked = rd.PoseGoal("panda_hand", AHEAD)
     result = rd.plan(rd.Problem(ROBOT, rd.Scene([POST]), START, END, waypoints=[MIDDLE, blocked]), time_limit=10.0)
     assert result.status is rd.Status.INVALID_GOAL and result.reason.startswith("segment 2 of 3: all")
+
+
+def test_a_configuration_in_collision_is_not_planned_to_again_with_other_seeds() -> None:
+    """Regression: after a pose as waypoint, this was repeated until time ran out."""
+    ball = rd.Sphere(ROBOT.fk(END, "panda_hand")[:3, 3], 0.02)
+    problem = rd.Problem(ROBOT, rd.Scene([ball]), START, END, waypoints=[rd.PoseGoal("panda_hand", AHEAD)])
+    with patch.object(Planner, "attempt", autospec=True, side_effect=Planner.attempt) as attempt:
+        assert rd.plan(problem, time_limit=10.0).status is rd.Status.INVALID_GOAL
+    assert attempt.call_count == 2
 
 
 def test_files_keep_goals_and_waypoints(tmp_path: Path) -> None:

@@ -139,7 +139,7 @@ class PlanningContext:
             planner_name: Name of the planner, for the result.
             problem: The problem.
             request: The other arguments of the call.
-            segments: Number of planned paths that are joined to one motion. Timing uses so many
+            segments: Number of planned paths that are joined into one motion. Timing uses so many
                 times the intervals of a single path.
 
         Raises:

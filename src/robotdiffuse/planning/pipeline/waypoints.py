@@ -9,10 +9,10 @@ A waypoint with a blend is a corner between two segments. It is rounded like the
 as its blend and the obstacles allow. The motion stops at the waypoint if no rounding is free, or if
 stopping is faster, as it may be where the path turns back.
 
-A motion from a start velocity begins while the arm is moving, without acceleration. It starts with a straight
-line that is long enough to stop on, in the direction of the velocity. The planner plans from the end of this
-line. The path with the line is then timed from the start velocity. The corner at the end of the line is
-rounded if it is free, so that the arm need not stop there.
+A motion from a start velocity begins while the arm moves at this velocity, with zero acceleration. It starts
+with a straight line that is long enough to stop on, in the direction of the velocity. The planner plans from
+the end of this line. The path with the line is then timed from the start velocity. The corner at the end of
+the line is rounded if it is free, so that the arm need not stop there.
 """
 
 from collections.abc import Sequence
@@ -46,8 +46,8 @@ from robotdiffuse.validation.validator import verifier
 BLEND_FRACTION = 0.9
 """Fraction of a blend that is used; the remainder covers the motion between the validator's samples."""
 MAX_DEVIATION_PER_BLEND = 10.0
-"""First corner deviation that is tried, per meter of blend [rad/m]. It is large, because some joints move the
-frame only a little."""
+"""First corner deviation that is tried [rad], as a multiple of the blend [m] or [rad]. It is large, because
+some joints move the frame only a little."""
 # Deviations are tried in turn, at most MAX_DEVIATIONS; each is DEVIATION_FACTOR times the one before.
 DEVIATION_FACTOR = 0.9
 MAX_DEVIATIONS = 80
@@ -79,8 +79,10 @@ def plan_through_waypoints(planner: Solver, problem: Problem, request: PlanReque
         else:
             return _joined(context, segments, _motions(context, segments))
         attempts += 1
-        if not any(has_choice[: len(segments) - 1]) or context.remaining <= 0:
-            failed = segments[-1]
+        failed = segments[-1]
+        # another seed cannot make invalid configurations valid
+        hopeless = failed.status is Status.INVALID_GOAL and isinstance(goals[len(segments) - 1], JointGoal)
+        if hopeless or not any(has_choice[: len(segments) - 1]) or context.remaining <= 0:
             reason = f"segment {len(segments)} of {len(goals)}: {failed.reason}"
             # INVALID_START would blame the problem's start, but a later segment begins at a planned
             # configuration
@@ -89,8 +91,8 @@ def plan_through_waypoints(planner: Solver, problem: Problem, request: PlanReque
 
 
 def _motions(context: PlanningContext, segments: Sequence[PlanResult]) -> list[Trajectory]:
-    """The motions from stop to stop. Segments between two stops are blended to one motion if it is valid and
-    faster than stopping at the waypoints between them."""
+    """The motions from stop to stop. Segments between two stops are blended into one motion if it is valid
+    and faster than stopping at the waypoints between them."""
     blend = context.problem.blend
     motions = list[Trajectory]()
     first = 0
@@ -218,16 +220,16 @@ def join(
             have different path constraints, or Cartesian lines.
         time_limit: Wall time of the call [s].
         request: Further arguments of `rd.plan`: clearance, velocity_scaling, ... A rounded corner is timed
-            anew with the limits of this call, as are the motions that meet there; give the scalings again
-            that the motions were planned with.
+            anew with the limits of this call, as are the motions that meet there; so give the scalings with
+            which the motions were planned.
 
     Returns:
         A result whose problem has the goals of all motions but the last as waypoints; or a result that says
         why the joined motion is not valid.
 
     Raises:
-        InputError: For results without a motion, for different robots or scenes, and for motions that do not
-            meet.
+        InputError: For results without a motion, or with waypoints or a start velocity; for different robots
+            or scenes; and for motions that do not meet.
 
     Examples:
         >>> space = rd.Workspace(rd.load_robot("panda"))
@@ -238,10 +240,14 @@ def join(
     check_type("results", results, (list, tuple), "a list of results")
     for i, result in enumerate(results):
         check_type(f"results[{i}]", result, PlanResult, "a PlanResult")
-        if result.problem is None or not result.solved:
-            raise InputError(f"results[{i}] has no motion, or no problem: {result.reason}")
+        if not result.solved:
+            raise InputError(f"results[{i}] has no motion: {result.reason}")
+        if result.problem is None:
+            raise InputError(f"results[{i}] has no problem; it must be a result of rd.plan")
         if result.problem.waypoints:
             raise InputError(f"results[{i}] has waypoints; join motions without them")
+        if result.problem.start_velocity is not None:
+            raise InputError(f"results[{i}] has a start_velocity; it must begin at rest")
     if len(results) < 2:
         raise InputError(f"results has {counted(len(results), 'result')}; it takes two to join")
     problems = [result.problem for result in results]
@@ -309,7 +315,7 @@ def plan_from_start_velocity(planner: Solver, problem: Problem, request: PlanReq
         return context.fail(Status.INVALID_START, reason)
     result = planner.attempt(replace(problem, start=stop, start_velocity=None), request)
     if result.path is None:
-        return replace(result, reason=f"from where the arm can stop: {result.reason}")
+        return replace(result, reason=f"planning from where the arm comes to rest: {result.reason}")
     waypoints = np.concatenate([problem.start[None], result.path.positions])
     deviations = np.full(len(waypoints), TIMING.corner_deviation)
     deviations[2:] = result.corner_deviations[1:]
