@@ -127,7 +127,7 @@ def test_mimic_joints_follow(tmp_path: Path) -> None:
         refuses(r"third is 0.3; it follows other, .* at -0.2; lock other", arm.with_locked, {"third": 0.3})
 
 
-def test_mimics_of_planned_joints_raise_unless_they_are_locked(tmp_path: Path) -> None:
+def test_mimics_of_planned_joints_raise_unless_these_are_locked_or_above_the_base(tmp_path: Path) -> None:
     bar = link("bar") + joint("rod", "j1_link", "bar", more='<mimic joint="j2" multiplier="-1"/>')
     file = written(tmp_path, ARM, bar)
     refuses(r"rod mimics j2, which is planned; .*--lock j2=VALUE.*, or remove rod and what it carries", read_urdf, file)
@@ -137,6 +137,8 @@ def test_mimics_of_planned_joints_raise_unless_they_are_locked(tmp_path: Path) -
     assert framed.dof == 6 and "the pose of bar is wrong" in "".join(framed.notes)
     inside = link("end") + joint("last", "j6_link", "end", more='<mimic joint="j5"/>')
     refuses("last mimics j5", read_urdf, written(tmp_path, ARM, inside), tip="end")
+    # regression: a KeyError
+    assert read_urdf(written(tmp_path, ARM, inside), tip="end", base="j5_link").locked == {"last": 0.0}
 
 
 @pytest.mark.parametrize("followed", ["nobody", "rod", "other"])
@@ -180,10 +182,11 @@ def test_groups_poses_and_passive_joints_of_an_srdf(tmp_path: Path) -> None:
     assert read_urdf(file, group="all", srdf=srdf).joint_names == ("j2", "j3", "j5", "j6", "grip")
     for group, message in (
         ("wrong", "unknown joint of group wrong .* 'nobody'"),
-        ("circle", "unknown group .* 'circle'"),
+        ("circle", "group circle contains itself"),
         ("nothing", "unknown group .* 'nothing'; known: all, arm, circle, hand, j, short, wrong"),
     ):
         refuses(message, read_urdf, file, group=group, srdf=srdf)
+    refuses("no joints below the base lead from j1_link to j6_link", read_urdf, file, base="j2_link", group="arm", srdf=srdf)
 
 
 @pytest.mark.parametrize(
@@ -193,6 +196,7 @@ def test_groups_poses_and_passive_joints_of_an_srdf(tmp_path: Path) -> None:
         ("<mujoco/>", "not an SRDF"),
         ("<robot><disable_collisions link1='a'/></robot>", "has no link2"),
         ("<robot><group_state name='s'><joint name='j' value='x'/></group_state></robot>", "value is 'x'; it must be a number"),
+        ("<robot><group_state name='s'><joint name='j' value=' '/></group_state></robot>", "value is ' '; it must be a number"),
     ],
 )
 def test_damaged_srdf(text: str, message: str, tmp_path: Path) -> None:

@@ -187,7 +187,7 @@ class ReplannerSettings(Settings, name="replanner"):
     by at least four of these times."""
     jerk: Jerk | None = None
     """Jerk limit of every joint [rad/s³] or [m/s³]; None: each joint's own limit, and no limit for a joint
-    without one. The default of `rd.plan` for such joints, 10 / s times the acceleration limit, would make
+    without one. The default of `rd.plan` for such joints, 10 s⁻¹ times the acceleration limit, would make
     stops much longer."""
 
 

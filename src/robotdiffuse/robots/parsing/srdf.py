@@ -65,7 +65,9 @@ class Srdf:
         return [tip for _, tip in content.chains] + [tip for sub in content.groups for tip in self.tips(sub)]
 
     def _named(self, group: str, above: dict[str, Joint], within: tuple[str, ...]) -> set[str]:
-        if group not in self.groups or group in within:
+        if group in within:
+            raise InputError(f"{self.path}: group {group} contains itself")
+        if group not in self.groups:
             raise unknown_name(f"group in {self.path}", group, self.groups)
         content = self.groups[group]
         joint_names = {joint.name for joint in above.values()}
@@ -77,7 +79,9 @@ class Srdf:
             link = tip
             while link != base:
                 if link not in above:
-                    raise InputError(f"{self.path}: group {group}: no joints lead from {base} to {tip}")
+                    raise InputError(
+                        f"{self.path}: group {group}: no joints below the base lead from {base} to {tip}"
+                    )
                 names.add(above[link].name)
                 link = above[link].parent
         return names.union(*(self._named(name, above, (*within, group)) for name in content.groups))
@@ -127,7 +131,7 @@ def read_srdf(file: str | Path) -> Srdf:
     def number(element: ET.Element) -> float:
         try:
             value = float(text(element, "value").split()[0])
-        except ValueError:
+        except (ValueError, IndexError):
             value = math.nan
         if not abs(value) <= MAX_COORDINATE:
             raise InputError(
@@ -163,15 +167,16 @@ def read_srdf(file: str | Path) -> Srdf:
 
 
 GRIPPER = re.compile("grip|finger|jaw|claw|knuckle|thumb", re.IGNORECASE)
-"""Matches names of joints that count as gripper joints if few joints come after them. Words that the joint
-before has too do not count, since all joints of a robot may be called finger."""
+"""Matches words in names of gripper joints. A joint counts as a gripper joint if few joints come after it and
+its name has more of these words than the name of the joint before it, since all joints of a robot may be
+called finger."""
 BOTH = "both"
 """Name of the group of all arms of a robot with two arms."""
 ALL = "all"
 """Name of the group of all arms, for any number of arms from two on."""
 FINGER = re.compile("finger|fngr|jaw|claw|knuckle|thumb", re.IGNORECASE)
-"""Matches names of links that are moved by the last joint of an arm with at least MIN_ARM_JOINTS other
-joints. This joint then counts as a gripper joint, under any name."""
+"""Matches names of fingers. If the last joint of an arm moves a link with such a name, and at least
+MIN_ARM_JOINTS own joints come before this joint, it counts as a gripper joint under any name."""
 SUFFIX_CHARACTERS = "_-/0123456789 "
 """Characters stripped from the end of the common prefix of an arm's joint names."""
 MAX_FINGER_JOINTS = 2
@@ -179,9 +184,9 @@ MAX_FINGER_JOINTS = 2
 MAX_HAND_FINGER_JOINTS = 3
 """Largest number of independent joints per finger of a gripper with another number of fingers."""
 MIN_ARM_JOINTS = 4
-"""Chains with fewer own joints (see `Arm.own_joints`) count as arms only if no chain has as many. After this
-many own joints, three or more branches form a hand, with any number of joints per finger; but one or two
-branches with at least LIMB_JOINTS joints are arms, as those of a torso that carries a head too."""
+"""Chains with fewer own joints (see `Arm.own_joints`) count as arms only if no chain has as many. Three or
+more branches after this many own joints form a hand, with any number of joints per finger, unless one or two
+of them have at least LIMB_JOINTS joints: these are arms, on a torso that may carry a head too."""
 LIMB_JOINTS = 6
 """Smallest number of independent joints of arms on a torso."""
 
@@ -259,8 +264,8 @@ class JointTree:
         return ((*chain, joint.name), own_joints + 1) if joint.kind in MOVING_KINDS else (chain, own_joints)
 
     def _begins_gripper(self, branches: list[Joint], own_joints: int, before: str) -> bool:
-        """Whether `branches` begin a gripper or a hand; `own_joints` joints precede them since the last
-        branching, and `before` is the last of these."""
+        """Whether `branches` begin a gripper or a hand. `before` is the joint before them; `own_joints`
+        joints precede them since the last branching."""
         lengths = [self._chain_length(joint) for joint in branches]
         if len(branches) == 1:
             [joint] = branches
@@ -329,13 +334,13 @@ def _ends(chosen: list[str], above: dict[str, Joint], written: list[str]) -> lis
 
 
 def linkage_notes(file: Path, robot: Robot) -> list[str]:
-    """Notes on joints that mimic planned joints, which planning keeps still. Raises InputError if such a
-    joint moves geometry or a tip."""
+    """Notes on joints that mimic planned joints: planning holds these mimic joints. Raises InputError if one
+    of them moves geometry or a tip."""
     by_name = {joint.name: joint for joint in robot.joints}
     notes = []
     for joint in robot.joints:
         leader = joint
-        while leader.mimic:
+        while leader.mimic and leader.mimic.joint in by_name:
             leader = by_name[leader.mimic.joint]
         if leader is joint or leader.name in robot.locked:
             continue
@@ -345,7 +350,9 @@ def linkage_notes(file: Path, robot: Robot) -> list[str]:
                 f"{file}: {what}hold {leader.name} with --lock {leader.name}=VALUE, end the arm above it "
                 f"with --tip, or remove {joint.name} and what it carries, which is then not checked"
             )
-        notes.append(f"{what}it is held, so the pose of {joint.child} is wrong and must not be a goal")
+        notes.append(
+            f"{what}{joint.name} is held, so the pose of {joint.child} is wrong and must not be a goal"
+        )
     return notes
 
 

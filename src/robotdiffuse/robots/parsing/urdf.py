@@ -193,7 +193,7 @@ class UrdfTree:
         planned are locked: at the value in `locked`, else at their value in a rest pose of the SRDF or at
         zero, clipped to their limits. Locked mimic joints follow the joints that they mimic.
 
-        Acceleration and jerk limits, which URDF lacks, are 4 / s times the velocity limit and 10 / s times
+        Acceleration and jerk limits, which URDF lacks, are 4 s⁻¹ times the velocity limit and 10 s⁻¹ times
         the acceleration limit; `limits` may change them. Each collision element becomes a convex hull in
         the link's frame; cylinders, capsules and spheres become polyhedra around the shape. If no link has
         collision elements, visual elements are used, with a note.
