@@ -124,7 +124,7 @@ def test_wrong_shapes() -> None:
     refuses("must not be zero", rd.Box, [0, 0, 0], [1, 1, 1], [0, 0, 0, 0])
     refuses("cylinder.height is inf", rd.Cylinder, [0, 0, 0], 1, np.inf)
     refuses("capsule.radius is None", rd.Capsule, [0, 0, 0], None, 1)
-    refuses("indices of the 1 vertices", rd.Mesh, [[0, 0, 0]], [[0, 0, 1]])
+    refuses("integer indices of the 1 vertices", rd.Mesh, [[0, 0, 0]], [[0, 0, 1]])
     refuses("mesh.faces", rd.Mesh, [[0, 0, 0]], [])
     refuses("an array of 1 x 2; it must be n x 3", rd.PointCloud, [[0, 0]])
     refuses(r"points\[0\] is \[0.0, 0.0, inf\]; its numbers must be finite", rd.PointCloud, [[0, 0, np.inf]])

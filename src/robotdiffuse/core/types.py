@@ -148,8 +148,8 @@ def no_type_check(kind: type[T]) -> type[T]:
 
 @dataclass_transform(eq_default=False, frozen_default=True, field_specifiers=(field,))
 def frozen_dataclass(kind: type[T]) -> type[T]:
-    """`dataclass(frozen=True, eq=False)`, of which mypy would not know that constructors take what can be set
-    to a field, such as a list for a GivenVector."""
+    """`dataclass(frozen=True, eq=False)`. It also tells mypy that constructors take all that can be set to a
+    field, such as a list for a GivenVector."""
     return dataclass(frozen=True, eq=False)(kind)
 
 

@@ -279,7 +279,7 @@ class Cylinder(_Axial):
         name: Name in results, commands and allowed contacts.
     """
 
-    # declared again, because mypy takes inherited fields for what is stored, not for what can be given
+    # declared again, because mypy lets constructors take only the stored types of inherited fields
     center: GivenVector
     wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     name: str = "cylinder"
@@ -309,7 +309,7 @@ class Capsule(_Axial):
         name: Name in results, commands and allowed contacts.
     """
 
-    # declared again, because mypy takes inherited fields for what is stored, not for what can be given
+    # declared again, because mypy lets constructors take only the stored types of inherited fields
     center: GivenVector
     wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     name: str = "capsule"
@@ -462,7 +462,7 @@ class Mesh(_Posed, Triangulated):
         if not (faces == np.floor(faces)).all() or faces.min() < 0 or faces.max() >= len(self.vertices):
             raise InputError(
                 f"mesh.faces holds values from {faces.min():g} to {faces.max():g}; "
-                f"they must be indices of the {len(self.vertices)} vertices"
+                f"they must be integer indices of the {len(self.vertices)} vertices"
             )
         object.__setattr__(self, "faces", read_only(faces.astype(np.int64)))
 
