@@ -68,7 +68,7 @@ async def _serve(
         make_app(pool, robots),
         lifespan="off",
         http=Connection,
-        log_level="error",  # `Access` and `Connection` log mistakes of clients
+        log_level="error",  # `Connection` and `Access` in `app.py` log mistakes of clients
         access_log=False,
         server_header=False,
         timeout_keep_alive=KEEP_ALIVE_TIMEOUT,
@@ -85,7 +85,7 @@ async def _serve(
             others = f"; {remaining} more {'is' if remaining == 1 else 'are'} starting" if remaining else ""
             say(f"ready, with 1 worker{others}")
 
-    say(f"listening on {_address(listener)}; loading compiled code (about a minute on a new machine)")
+    say(f"listening on {_address(listener)}; loading code (about a minute if it must be compiled)")
     starting = asyncio.ensure_future(pool.start())
     starting.add_done_callback(started)
     try:

@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from math import ceil
 
@@ -56,8 +55,7 @@ class WorkerPool:
         self.arriving_bytes = 0
         """Data received so far of requests that are still arriving [bytes]."""
         self.stopping = False
-        copies = {name: replace(robot) for name, robot in robots.items()}  # without compiled arrays
-        self._workers = Workers(settings.workers, worker.prepare, (copies, settings), 0.0, keep_ready=True)
+        self._workers = Workers(settings.workers, worker.prepare, (robots, settings), 0.0, keep_ready=True)
         self._request_seconds = INITIAL_REQUEST_SECONDS
         for name, description in GAUGES.items():
             self.metrics.gauge(name, description, lambda name=name: self.state()[name])
