@@ -169,8 +169,8 @@ class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
                 result = context.finish(start_goal.complete(attempt.path), self.name)
                 if result is not None:
                     return result
-        # validates the best colliding sample, so that the result tells what is wrong with it; the sample was
-        # checked by covering spheres, so the exact meshes may even be free
+        # validates the best colliding sample, so that `refused` of the result says what is wrong with it; the
+        # sample was checked by covering spheres, so the exact meshes may even be free
         closest = min(colliding, key=lambda attempt: attempt[:2], default=None)
         result = None if closest is None else context.finish(start_goal.complete(closest.path), self.name)
         return result or context.unsolved(

@@ -13,7 +13,8 @@ Differences from the paper, in addition to those of the network:
 - The paper has one roll-out. The repetitions cannot lower the success rate, and they use the time that all
   planners get. They are distributed over the goals, the nearest first, and end where the arm collides.
 - Motions are not repaired or shortened, and a motion that the validator refuses is not a result. If there is
-  no valid motion, the best one is validated at the end, so that the result tells what is wrong with it.
+  no valid motion, the best one is validated at the end, so that `refused` of the result says what is wrong
+  with it.
 """
 
 from dataclasses import dataclass

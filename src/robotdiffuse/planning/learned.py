@@ -25,9 +25,9 @@ SAMPLES_PER_GOAL = 4
 @dataclass(frozen=True)
 class LearnedSettings(Settings):
     weights: str | None = None
-    """Folder of trained weights, or "panda_points": bundled weights of a network without clearances as
-    inputs.
-    None: weights that were trained on this machine for the robot, or else its bundled weights."""
+    """Folder of trained weights. For `diffusion` also "panda_points": bundled weights of a network without
+    clearances as inputs. None: weights that were trained on this machine for the robot, or else the robot's
+    bundled weights."""
 
 
 LearnedPlannerSettings = TypeVar("LearnedPlannerSettings", bound=LearnedSettings)
@@ -40,7 +40,7 @@ class LearnedPlanner(Planner[LearnedPlannerSettings]):
     """Name of the network in `learning.NETWORKS`."""
 
     def __init__(self, settings: LearnedPlannerSettings | None = None) -> None:
-        """Raises InputError if the folder that the settings name holds no weights."""
+        """Raises InputError if the folder in the setting `weights` holds no weights."""
         super().__init__(settings)
         check_weights(self.network_name, self.settings.weights)
 

@@ -49,8 +49,8 @@ class Excess(NamedTuple):
     value: float
     """The torque of the joint [N m] or [N], or the speed of the frame [m/s]."""
     excess: float
-    """By how much the joint or frame exceeds its limit and the allowed slack, at most along the motion, in
-    the unit of `value`."""
+    """Largest amount by which this joint or frame exceeds its limit plus the allowed slack, anywhere on the
+    motion, in the unit of `value`."""
 
 
 def trajectory_pieces(trajectory: Trajectory) -> Pieces:

@@ -242,12 +242,12 @@ def separation(hulls, p, solids, other, reference, posture):
         _support_of_part(hulls, -1 - other, posture, 1.0, 2)
         reach = hulls.rounding[-1 - other]
     reach += dot(n, posture.points[2])
+    # 1e-9 covers floating-point errors in the length of the normal, which are multiplied by the size of the
+    # bodies
     if other < 0 and hulls.frame[-1 - other] != reference:
         start, stop = _lowest_along(hulls, p, reference, 1.0, posture)
         other_start, other_stop = _lowest_along(hulls, -1 - other, reference, -1.0, posture)
         return middle - reach - 1e-9, min(start + other_start, stop + other_stop) - 1e-9
-    # 1e-9 covers floating-point errors in the length of the normal, which are multiplied by the size of the
-    # bodies
     return middle - reach - 1e-9, along - reach - 1e-9
 
 
