@@ -137,7 +137,6 @@ def test_mimics_of_planned_joints_raise_unless_these_are_locked_or_above_the_bas
     assert framed.dof == 6 and "the pose of bar is wrong" in "".join(framed.notes)
     inside = link("end") + joint("last", "j6_link", "end", more='<mimic joint="j5"/>')
     refuses("last mimics j5", read_urdf, written(tmp_path, ARM, inside), tip="end")
-    # regression: a KeyError
     assert read_urdf(written(tmp_path, ARM, inside), tip="end", base="j5_link").locked == {"last": 0.0}
 
 
