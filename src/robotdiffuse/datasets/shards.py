@@ -279,20 +279,24 @@ def write_shard(
         "fingerprint": _fingerprint(converted),
         "counts": dict(sorted(counts.items())),
     }
+    # first in memory: zarr's threads would write on after the error of a full disk
+    files: dict[str, Any] = {}
+    group = zarr.open_group(files, mode="w", zarr_format=3, attributes=attributes)
+    for name, array in converted.items():
+        group.create_array(
+            name,
+            data=array,
+            chunks=tuple(max(1, size) for size in array.shape),
+            compressors=None if name == "trajectories" else zarr.codecs.ZstdCodec(level=COMPRESSION_LEVEL),
+            filters=None,
+            # write chunks of zeros too, so that a missing file means damage
+            config={"write_empty_chunks": True},
+        )
     with replaced_folder(target) as new_folder:
-        group = zarr.open_group(new_folder, mode="w", zarr_format=3, attributes=attributes)
-        for name, array in converted.items():
-            group.create_array(
-                name,
-                data=array,
-                chunks=tuple(max(1, size) for size in array.shape),
-                compressors=None
-                if name == "trajectories"
-                else zarr.codecs.ZstdCodec(level=COMPRESSION_LEVEL),
-                filters=None,
-                # write chunks of zeros too, so that a missing file means damage
-                config={"write_empty_chunks": True},
-            )
+        for name, content in files.items():
+            file = new_folder / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(content.to_bytes())
 
 
 def _fingerprint(arrays: dict[str, ndarray]) -> str:

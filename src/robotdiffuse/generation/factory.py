@@ -22,7 +22,6 @@ from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError, check_name, needs
-from robotdiffuse.core.interrupts import delay_interrupts
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Settings, SettingsOf, Share
@@ -299,9 +298,7 @@ def generate(
             with closing(_shards(settings, missing, workers, cluster)) as shards:
                 for number, (arrays, counts) in shards:
                     index = missing[number]
-                    # without the delay, zarr's threads could write files after the clean-up
-                    with delay_interrupts():
-                        write_shard(out, index, arrays, counts)
+                    write_shard(out, index, arrays, counts)
                     finished += settings.rows(index)
                     progress(finished, settings.trajectories)
         finally:
