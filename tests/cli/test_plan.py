@@ -1,7 +1,10 @@
 """The commands `plan`, `demo` and `explore`: exit status, one line for bad input, and written files."""
 
+import ctypes
 import json
 import os
+import signal
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +16,7 @@ import pytest
 import robotdiffuse as rd
 from helpers.commands import GOAL, PROBLEM, START, Said, run, write_problem
 from robotdiffuse.cli.demo import shelf_problem
+from robotdiffuse.core.interrupts import handled
 from robotdiffuse.planning import load_planner, planner_settings
 from robotdiffuse.problems.files import load_problem, problem_record
 from robotdiffuse.visualization.picture import PictureSettings
@@ -99,12 +103,18 @@ def test_problem_of_a_jsonl_file(tmp_path: Path, said: Said) -> None:
 
 
 def test_ctrl_c(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, said: Said) -> None:
-    """Regression: in compiled code that makes tuples, Ctrl-C is the cause of a SystemError, whose traceback was printed."""
+    """Regressions: Ctrl-C is the cause of a SystemError in compiled code that makes tuples; a callback loses it."""
+
+    def lost(*_: object, **__: object) -> None:
+        ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()
+        time.sleep(60.0)
+
     from_compiled_code = SystemError("returned a result with an exception set")
     from_compiled_code.__cause__ = KeyboardInterrupt()
-    for error in (KeyboardInterrupt, from_compiled_code):
+    for error in (KeyboardInterrupt, from_compiled_code, lost):
         monkeypatch.setattr("robotdiffuse.cli.plan.load_and_plan", Mock(side_effect=error))
-        assert said(130, "plan", write_problem(tmp_path), "--planner", "rrt_connect") == "robotdiffuse: stopped\n"
+        with handled(signal.default_int_handler, signal.SIGINT):
+            assert said(130, "plan", write_problem(tmp_path), "--planner", "rrt_connect") == "robotdiffuse: stopped\n"
 
 
 def test_plan_takes_settings_of_the_planner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,17 +6,22 @@ import errno
 import io
 import os
 import re
+import signal
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib import import_module
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from robotdiffuse import __version__
 from robotdiffuse.cli.arguments import BAD_INPUT, STOPPED, WRITE_FAILED
 from robotdiffuse.cli.commands import COMMANDS
 from robotdiffuse.core.errors import InputError, OutputError, suggestion
+from robotdiffuse.core.interrupts import handled
 from robotdiffuse.core.registry import import_modules
+
+RETRY_DELAY = 0.05
+"""Time after which a lost Ctrl-C is tried again [s]."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -60,6 +65,35 @@ def build_parser() -> Parser:
     return parser
 
 
+@contextmanager
+def _repeated_interrupts() -> Iterator[None]:
+    """Within the block, a Ctrl-C that is lost in a callback, as while compiled code is loaded, is repeated
+    until it arrives."""
+    report = sys.unraisablehook
+
+    def schedule(lost: Any) -> None:
+        if lost.exc_type is KeyboardInterrupt:
+            # later, since a second one would be lost in the same callback
+            signal.setitimer(signal.ITIMER_REAL, RETRY_DELAY)
+        else:
+            report(lost)
+
+    def repeat(_number: int, frame: Any) -> None:
+        if frame.f_code is schedule.__code__:
+            signal.setitimer(signal.ITIMER_REAL, RETRY_DELAY)
+        else:
+            signal.raise_signal(signal.SIGINT)
+
+    sys.unraisablehook = schedule
+    with handled(repeat, signal.SIGALRM):
+        try:
+            yield
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            sys.unraisablehook = report
+
+
+@_repeated_interrupts()
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status; bad input is reported as one line on standard error."""
     _prepare_streams()
