@@ -92,6 +92,13 @@ def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path, 
     assert bench.run_bench(asked, quiet, quiet) == 0
 
 
+def test_logs_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
+    """Regression: no process could start, and every call was recorded as a crash."""
+    (tmp_path / "logs").write_text("")
+    spec = bench.PlannerSpec.parse("rrt_connect")
+    refuses(r"logs/a\.log cannot be written", bench.PlannerProcess, spec, tmp_path / "logs" / "a.log")
+
+
 def test_a_planner_of_the_program_itself_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PLANNERS, "mine", registry.Entry("__main__:Mine", "for tests"))
     refuses("planner mine is in the program that was started", bench.run_bench, settings(tmp_path, "mine"), quiet, quiet)

@@ -22,7 +22,7 @@ from typing import Annotated, Any
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, check_name
 from robotdiffuse.core.input_files import is_file
-from robotdiffuse.core.output_files import JsonLines, lock_folder
+from robotdiffuse.core.output_files import JsonLines, lock_folder, writing
 from robotdiffuse.core.settings import Count, Filled, OneOf, Positive, Settings
 from robotdiffuse.evaluation.metrics import measured
 from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name
@@ -143,7 +143,13 @@ class PlannerProcess:
     """A planner in another process. The process starts with the first run, and again after it has died."""
 
     def __init__(self, spec: PlannerSpec, log: FilePath, cpu_time: bool = False) -> None:
-        """The output of the process is appended to the file `log`. For `cpu_time` see `BenchSettings`."""
+        """The output of the process is appended to the file `log`. For `cpu_time` see `BenchSettings`.
+
+        Raises InputError if this file cannot be written: its process would end, which would count as a crash.
+        """
+        with writing(log):
+            log.parent.mkdir(parents=True, exist_ok=True)
+            log.touch()
         self._log = log
         self._worker = Worker(_prepare, (spec, str(log), cpu_time))
 
@@ -208,7 +214,6 @@ def _prepare(spec: PlannerSpec, log: str, cpu_time: bool) -> None:
     global _planner, _request
     if cpu_time:
         time.perf_counter = time.process_time
-    FilePath(log).parent.mkdir(parents=True, exist_ok=True)
     with open(log, "a") as stream:
         os.dup2(stream.fileno(), 1)
         os.dup2(stream.fileno(), 2)
