@@ -143,6 +143,8 @@ def test_threads_that_write_one_file_leave_one_of_their_texts(tmp_path: Path) ->
     with ThreadPoolExecutor(2) as threads:
         list(threads.map(write, texts))
     assert file.read_text() in texts and list(tmp_path.iterdir()) == [file]
+    write_atomically(file, "folder a\udcff")  # regression: a page titled by a folder whose name is not UTF-8
+    assert file.read_text() == "folder a?"
 
 
 def test_a_row_that_is_not_written_whole_is_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

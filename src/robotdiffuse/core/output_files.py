@@ -50,7 +50,7 @@ def write_atomically(
                 if callable(content):
                     content(stream)
                 else:
-                    stream.write(content.encode() if isinstance(content, str) else content)
+                    stream.write(content.encode("utf-8", "replace") if isinstance(content, str) else content)
             temporary.replace(file)
         except BaseException:
             with suppress(OSError):
@@ -188,7 +188,7 @@ def lock_folder(out: Path) -> Iterator[None]:
         try:
             out.mkdir(parents=True, exist_ok=True)
         except FileExistsError:
-            raise InputError(f"cannot use the folder {out}: it is a file") from None
+            raise InputError(f"cannot use the folder {out}: it is a file, or a link to nothing") from None
         TemporaryFile(dir=out).close()
         folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
     try:
