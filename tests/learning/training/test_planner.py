@@ -124,6 +124,8 @@ def test_device_is_checked(data, tmp_path, monkeypatch):
     refuses("has trained on cpu; start a new process", Processes, "cuda")
     monkeypatch.setitem(sys.modules, "accelerate", None)
     refuses(r"pip install \"robotdiffuse\[train\]\"", Processes, None)
+    monkeypatch.setattr(torch, "get_default_dtype", lambda: torch.float64)
+    refuses(r"default dtype is torch\.float64; training needs .*\(torch\.float32\)", Processes, "cpu")
 
 
 @pytest.mark.parametrize("kind", ["encoder", "planner"])
@@ -234,6 +236,7 @@ def test_other_settings_and_a_damaged_checkpoint_are_refused(tmp_path, data):
     file = tmp_path / "out" / "training.safetensors"
     file.write_bytes(file.read_bytes()[:1000])
     refuses(r"training\.safetensors is damaged", *again)
+    refuses("name of the folder .* is not UTF-8", train_planner, planner_settings(data), str(tmp_path / "\udcff"))
 
 
 @pytest.mark.usefixtures("no_export")

@@ -35,7 +35,7 @@ from robotdiffuse.learning.training.config import ShareBelowOne, TrainingSetting
 from robotdiffuse.learning.training.loop import Processes, TrainingTask, Validation, train
 from robotdiffuse.perception.voxel_grid import VOXEL
 from robotdiffuse.problems.families import FAMILIES
-from robotdiffuse.processes.workers import Workers
+from robotdiffuse.processes.workers import EndedError, NotStartedError, Workers
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 
@@ -73,7 +73,13 @@ class SamplePrefetcher:
         following = copy.deepcopy(rng)
         upcoming = [self._seeds(following) for _ in range(1 + BATCHES_AHEAD * self._count)]
         self._pending = {seeds: self._pending.get(seeds) or self._submitted(seeds) for seeds in upcoming}
-        return self._pending[self._seeds(rng)].result()
+        seeds = self._seeds(rng)
+        try:
+            return self._pending[seeds].result()
+        except NotStartedError:
+            raise
+        except EndedError:  # killed, perhaps by the SIGTERM after which the training stores a checkpoint
+            return draw_samples(self._families, self._robot, seeds)
 
     def close(self) -> None:
         """Stop the workers."""

@@ -55,8 +55,14 @@ class Processes:
         """device: cpu, or cuda, each process on its own device; None: cuda if present.
 
         Matrices are multiplied in bf16 on devices that do so fast. Raises InputError if Accelerate is not
-        installed, the device is missing, or this process has trained on another device.
+        installed, the device is missing, this process has trained on another device, or PyTorch's default
+        type of numbers is not float32.
         """
+        default = torch.get_default_dtype()
+        if default != torch.float32:
+            raise InputError(
+                f"PyTorch's default dtype is {default}; training needs torch.set_default_dtype(torch.float32)"
+            )
         cuda = torch.cuda.is_available()
         if device == "cuda" and not cuda:
             raise InputError("device is cuda, but PyTorch finds no CUDA device here; use cpu")
@@ -223,6 +229,9 @@ class TrainingRun:
         self.settings = settings = task.settings
         self.processes = processes = task.processes
         self.out = FilePath(out)
+        # safetensors and TensorBoard could not open files there
+        if out.encode("utf-8", "replace").decode() != out:
+            raise InputError(f"the name of the folder {out} is not UTF-8; name another folder")
         self.parameters = nn.ParameterList(p for p in task.module.parameters() if p.requires_grad)
         self.average = AveragedModel(self.parameters, avg_fn=self._averaged)
         """The moving average of the parameters."""
