@@ -135,7 +135,7 @@ def test_failures_say_why(made: Planner) -> None:
 
 
 def test_bad_input() -> None:
-    refuses(r"objects must be empty; add obstacles by `planner\.workspace\.add", planner, objects=["box"])
+    refuses(r"objects must be empty; add obstacles with `planner\.workspace\.add", planner, objects=["box"])
     refuses(r"pose is \[0.5, 0, 0.4\]; it must be x, y, z and a quat", planner().plan_pose, [0.5, 0, 0.4], QPOS)
     refuses("pose is 'here'; it must be x, y, z and a quaternion", planner().plan_pose, "here", QPOS)
     refuses("pose is .*; it must be a homogeneous", planner().update_attached_box, [0.1] * 3, np.zeros((4, 4)))

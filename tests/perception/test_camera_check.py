@@ -142,6 +142,7 @@ def test_the_pose_is_estimated_from_views_of_the_arm() -> None:
     refuses("configuration", rd.calibrate_camera, [replace(at_home(), configuration=None)], PANDA)
     refuses("0 of 1 views have a configuration", rd.calibrate_camera, [replace(at_home(), configuration=[1, 2])], PANDA)
     refuses("views is .*; it must be a list of rd.DepthView", unwrap(rd.calibrate_camera), at_home(), PANDA)
+    refuses(r"views is \[\]; it must be a list of rd.DepthView, not empty", rd.calibrate_camera, [], PANDA)
     refuses("robot is 'panda'; it must be a Robot", unwrap(rd.calibrate_camera), views, "panda")
     refuses("views differ in T_base_camera", rd.calibrate_camera, [*views, replace(views[0], T_base_camera=T)], PANDA)
     elsewhere = replace(at_home(), depth=np.full_like(at_home().depth, 3.0))

@@ -130,7 +130,7 @@ def asked(*links: str) -> rd.Problem:
 
 def test_what_makes_no_sense_is_one_line() -> None:
     refuses("goal.poses names 'a' twice", rd.PosesGoal, [rd.PoseGoal("a", np.eye(4))] * 2)
-    refuses(r"goal.poses is \[\]; it must be a list of rd.PoseGoal", rd.PosesGoal, [])
+    refuses(r"goal.poses is \[\]; it must be a list of rd.PoseGoal, not empty", rd.PosesGoal, [])
     refuses("unknown link in goal.poses: 'middle'", asked, "left_gripper", "middle")
     refuses("goal.poses: no planned joint moves 'torso'", asked, "left_gripper", "torso")
     refuses("one rigid part; give the pose of one", asked, "left_gripper", "left_gripper_base_link")

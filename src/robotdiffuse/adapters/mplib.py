@@ -94,7 +94,7 @@ class Planner:
         joint_acc_limits: Acceleration limits of the planned joints [rad/s²]; none: those of the robot (MPlib:
             1).
         new_package_keyword: Another name for `package_keyword_replacement`.
-        objects: Must be empty; obstacles are added by `workspace.add`.
+        objects: Must be empty; obstacles are added with `workspace.add`.
         use_convex: Ignored: collision geometry is convex.
         verbose: Ignored.
 
@@ -120,7 +120,7 @@ class Planner:
         verbose: bool = False,
     ) -> None:
         if objects is not None and len(objects):
-            raise InputError("objects must be empty; add obstacles by `planner.workspace.add(rd.Box(...))`")
+            raise InputError("objects must be empty; add obstacles with `planner.workspace.add(rd.Box(...))`")
         check_list("user_joint_names", user_joint_names, str, "names of joints")
         check_list("user_link_names", user_link_names, str, "names of links")
         robot = _robot(urdf, move_group, srdf, package_keyword_replacement or new_package_keyword)
@@ -137,7 +137,7 @@ class Planner:
         self._links = {-1: move_group, **dict(enumerate(user_link_names))}
         limited = _limited(robot, joint_vel_limits, joint_acc_limits)
         self.workspace = Workspace(limited, move_group)
-        """The robot and its obstacles. Add obstacles other than point clouds by `planner.workspace.add`."""
+        """The robot and its obstacles. Add obstacles other than point clouds with `planner.workspace.add`."""
 
     @property
     def robot(self) -> Robot:

@@ -85,7 +85,7 @@ def load_certificate(file: str | FilePath) -> Certificate:
     known_ending(file, "certificate", (".json",))
     record = read_json(file)
     if not is_certificate(record):
-        raise InputError(f"{file} is not a certificate; write one by `robotdiffuse verify --certificate`")
+        raise InputError(f"{file} is not a certificate; write one with `robotdiffuse verify --certificate`")
     with reading(file):
         if record.get("version") != VERSION:
             version = shown(record.get("version"))
@@ -201,7 +201,7 @@ class Field(NamedTuple):
 
 
 def _typed(kind: Any) -> Field:
-    """A field of a type that `converted` takes."""
+    """A field whose value `converted` converts to this type."""
     return Field(lambda name, value: converted(name, kind, value))
 
 

@@ -107,8 +107,8 @@ class Linkage:
     def rates(
         self, postures: Postures, link: str
     ) -> tuple[Int[ndarray, "joints"], Float[ndarray, "n joints 3"]]:
-        """The planned joints that move a link, and the derivatives of its origin's position by each joint
-        [m/rad] or [m/m]."""
+        """The planned joints that move a link, and the derivatives of its origin's position with respect to
+        each joint [m/rad] or [m/m]."""
         k = self.links.index(link)
         joints = np.flatnonzero(self.moved[k])
         arms = postures.T[:, k, None, :3, 3] - postures.origins[:, joints]

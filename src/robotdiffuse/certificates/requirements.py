@@ -129,8 +129,8 @@ def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> It
     limit may be exceeded by the fraction `slack`.
 
     A velocity deviates from linear interpolation by at most an eighth of its largest second derivative times
-    the square of the interval. The derivative of a position by several joints is at most the lever arm of the
-    last of these joints.
+    the square of the interval. The derivative of a position with respect to several joints is at most the
+    lever arm of the last of these joints.
     """
     linkage = Linkage(problem.robot)
     cubics = cubics_of(motion)

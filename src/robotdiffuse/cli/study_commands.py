@@ -381,7 +381,7 @@ REPRODUCE = Command(
                 ("--problems N", "held-out problems (default: 500)", count),
                 ("--family NAME", "family of these problems (default: rop)"),
                 ("--rows NAME,...", "rows to train (default: all ten)", names),
-                ("--seeds N", "trainings of each row, with different seeds (default: 1)", count),
+                ("--seeds N", "training runs of each row, with different seeds (default: 1)", count),
                 (*ALL_CORES, os.cpu_count() or 1),
             ),
         ),

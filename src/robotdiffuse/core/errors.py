@@ -106,7 +106,9 @@ def check_list(
     message says that it must be a list of `wanted`."""
     of_kind = isinstance(value, list | tuple) and all(isinstance(entry, kinds) for entry in value)
     if not of_kind or len(value) < least:
-        raise InputError(f"{what} is {shown(value)}; it must be a list of {wanted}")
+        raise InputError(
+            f"{what} is {shown(value)}; it must be a list of {wanted}{', not empty' if least else ''}"
+        )
 
 
 def distinct(*values: float | int, digits: int = 6) -> list[str]:

@@ -104,7 +104,7 @@ class AblationSettings(Settings):
     data: str
     """Folder of a data set."""
     out: str
-    """Folder for the trained networks. Networks that exist there are used, and interrupted trainings
+    """Folder for the trained networks. Networks that exist there are used, and interrupted training runs
     continue."""
     samples: Count = 300_000
     """Number of training samples of each row; equal for all rows."""
@@ -117,7 +117,7 @@ class AblationSettings(Settings):
     candidates: Count = 16
     """Number of trajectories sampled for each problem."""
     seeds: Count = 1
-    """Number of trainings of each row, with seeds 0, 1, ...; figures are means over the trainings."""
+    """Number of training runs of each row, with seeds 0, 1, ...; figures are means over these runs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,7 @@ class Evaluation:
 
     @classmethod
     def mean(cls, trainings: "list[Evaluation]") -> "Evaluation":
-        """For each problem, the mean over several trainings; NaN lengths are left out."""
+        """For each problem, the mean over several training runs; NaN lengths are left out."""
         values = [np.stack([getattr(each, f.name) for each in trainings]) for f in fields(cls)]
         return cls(*(np.ma.masked_invalid(x).mean(axis=0).filled(np.nan) for x in values))
 
@@ -260,7 +260,7 @@ def _train(settings: AblationSettings, training: Training) -> Training:
 def _evaluate(
     settings: AblationSettings, which: Training | str, guided: bool, cases: list[Case]
 ) -> Evaluation:
-    """Evaluate a network or a control on problems. `which` is a training, or a name in CONTROLS."""
+    """Evaluate a network or a control on problems. `which` is a training run, or a name in CONTROLS."""
     robot = load_robot("panda")
     out = FilePath(settings.out)
     if isinstance(which, str):
@@ -297,7 +297,7 @@ NOTES = (
     "sample.",
     "length: mean length of the shortest valid sample, over the problems that have one; to first: mean ratio "
     "of this length to the length in the first row, over the problems that both rows solve. Intervals are "
-    "over problems, not over trainings: another seed may change a row by more.",
+    "over problems, not over training runs: another seed may change a row by more.",
     "no network: motions through fixed configurations, without guidance; the nearest motions of the data, "
     "bent to start and goal; smooth noise, which networks start from. Nearest motions and smooth noise get "
     f"{EQUAL_TIME_STEPS} gradient steps, which take as long as a network. Problems that the straight line "

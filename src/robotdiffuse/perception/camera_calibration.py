@@ -50,12 +50,13 @@ class CameraCalibration:
     covariance: Float[ndarray, "6 6"]
     """Covariance of the camera's position [m] and rotation vector [rad], in the base frame."""
     agreement: float
-    """Of the image cells in which the arm's model is visible, the fraction whose measured depth is the
-    model's."""
+    """Of the image cells in which the arm's model is visible, the fraction whose measured depth agrees with
+    the model's."""
 
     @property
     def pose_deviation(self) -> tuple[float, float]:
-        """Two standard deviations, for `DepthView.pose_deviation`: position [m] and angle [rad]."""
+        """Twice the standard deviation of the position [m] and of the angle [rad], for
+        `DepthView.pose_deviation`."""
         position, angle = (
             2 * float(np.sqrt(np.trace(self.covariance[i : i + 3, i : i + 3]))) for i in (0, 3)
         )
@@ -85,9 +86,9 @@ def calibrate_camera(views: Sequence[DepthView], robot: Robot) -> CameraCalibrat
         ```
     """
     check_type("robot", robot, Robot, "a Robot, e.g. rd.load_robot('panda')")
-    check_list("views", views, DepthView, "rd.DepthView")
+    check_list("views", views, DepthView, "rd.DepthView", least=1)
     each = [(view, q) for view in views if (q := view.configuration) is not None and len(q) == robot.dof]
-    if not each or len(each) < len(views):
+    if len(each) < len(views):
         raise InputError(
             f"{len(each)} of {len(views)} views have a configuration of {robot.name}'s {robot.dof} joints; "
             "calibrate_camera needs one for each"
@@ -104,7 +105,7 @@ def calibrate_camera(views: Sequence[DepthView], robot: Robot) -> CameraCalibrat
     points = [_near_arm(view, T, tree) for (view, _), (tree, _, _) in zip(each, models, strict=True)]
     hessian = np.eye(6)
     spread = 0.0
-    # Gauss-Newton steps: A holds the derivatives of the errors e by the camera's position and rotation
+    # Gauss-Newton steps: A is the Jacobian of the errors e with respect to the camera's position and rotation
     for gate in GATES:
         rows = list[ndarray]()
         errors = list[ndarray]()
@@ -118,7 +119,10 @@ def calibrate_camera(views: Sequence[DepthView], robot: Robot) -> CameraCalibrat
         A = np.concatenate(rows)
         e = np.concatenate(errors)
         if len(e) < MIN_CELLS:
-            raise InputError(f"the arm is hardly seen: {len(e)} points of the views are near it")
+            raise InputError(
+                f"the arm is hardly seen: {len(e)} points of the views are near it, at least {MIN_CELLS} are "
+                "needed; set T_base_camera of the views closer to the true pose, or bring the arm into view"
+            )
         weights = 1 / (1 + (e / (0.3 * gate)) ** 2) ** 2
         hessian = (A * weights[:, None]).T @ A + 1e-9 * np.eye(6)
         spread = float(np.sqrt((weights * e**2).sum() / weights.sum()))

@@ -323,7 +323,7 @@ def _deviation(view: DepthView, T: Pose, covariance: Float[ndarray, "6 6"]) -> t
     points = points[MAP.contains(MAP.indices(placed(T, points)))]
     if not len(points):
         return view.pose_deviation
-    # derivatives of the points' displacements by the pose's error, and the displacements' covariances
+    # derivatives of the points' displacements with respect to the pose's error, and their covariances
     turned = np.cross(np.eye(3), points[:, None]).swapaxes(1, 2)
     shifts = np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), turned], axis=2)
     spread = shifts @ covariance @ shifts.swapaxes(1, 2)

@@ -206,10 +206,10 @@ class PathConstraints:
         motion.
 
         By the chain rule, the third derivative of a position p is the sum of (d_j p) q'''_j,
-        3 (d_jk p) q''_j q'_k and (d_jkl p) q'_j q'_k q'_l. A partial derivative of p by several joints is at
-        most as long as the lever of the last of them in the chain. The sum of all products of rates whose
-        last joint is j is P(j) - P(j - 1), where P(j) is the product of the rates' sums over the joints up to
-        j.
+        3 (d_jk p) q''_j q'_k and (d_jkl p) q'_j q'_k q'_l. A partial derivative of p with respect to several
+        joints is at most as long as the lever of the last of them in the chain. The sum of all products of
+        rates whose last joint is j is P(j) - P(j - 1), where P(j) is the product of the rates' sums over the
+        joints up to j.
 
         derivatives: bounds on the first three derivatives of the joint positions, for each piece.
         """

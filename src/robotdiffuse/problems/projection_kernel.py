@@ -85,7 +85,7 @@ def _residuals(rows, limits, q, work):
                 work.e[count] = ANGLE_WEIGHT * (min(max(angle, -inner), inner) - angle)
             else:
                 work.e[count] = ANGLE_WEIGHT * work.error[3 + r] * share
-            # the derivatives by the joints of the chain
+            # the derivatives with respect to the joints of the chain
             for j in range(dof):
                 work.J[count, j] = 0.0
             for k in range(rows.chain_length[m]):

@@ -127,8 +127,8 @@ class Dynamics:
         return out
 
     def second_derivatives(self, along: Stretches) -> Configurations:
-        """Bounds on the second derivatives of torques by the fraction of the stretch, for each stretch and
-        joint."""
+        """Bounds on the second derivatives of torques with respect to the fraction of the stretch, for each
+        stretch and joint."""
         bodies = self._bodies
         still = np.zeros((3, len(along.q)))
         weight = still.copy()

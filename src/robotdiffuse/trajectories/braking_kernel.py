@@ -1,8 +1,8 @@
 """Compiled code for the speeds along a path: the motion is as fast as possible for a given time, then brakes
 to rest. It begins at the arm's current place on the path, with its current speed.
 
-The path is q(s), with the derivatives q' and q'' by s; s̈ is constant in each interval of a grid over s, and
-changes within an interval only where braking begins.
+The path is q(s); q' and q'' are its derivatives with respect to s. s̈ is constant in each interval of a grid
+over s, and changes within an interval only where braking begins.
 The limits of s̈ are evaluated at both ends of an interval, even if the motion covers only a part of it. So an
 s̈ that is within the limits when the motion enters the interval is within them until the motion leaves it.
 """
@@ -12,9 +12,9 @@ import numpy as np
 from robotdiffuse.core.kernels import kernel
 
 MIN_INTERVAL = 1e-10
-"""A motion that begins closer than this before a grid point begins in the interval after it [rad]."""
+"""If a motion begins less than this before a grid point [rad], its first interval is the one after it."""
 NEGLIGIBLE_DERIVATIVE = 1e-7
-"""Components of q' below this count as zero; the norm of q' is 1 on straight lines."""
+"""Factors of s̈ in q̈ below this count as zero; on straight lines these are q', whose norm is 1."""
 STILL_SPEED_SQUARED = 1e-12
 """ṡ² below this counts as rest [rad²/s²]."""
 

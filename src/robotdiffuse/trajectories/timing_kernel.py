@@ -68,7 +68,7 @@ class RoundedLine(NamedTuple):
         return float(self.knots[-1])
 
     def __call__(self, s: Values, order: int) -> JointRows:
-        """The path (order 0) or its first or second derivative by s, at each s."""
+        """The path (order 0) or its first or second derivative with respect to s, at each s."""
         return evaluate(self, s, order)
 
 
@@ -98,7 +98,7 @@ def evaluate_at(line, s, order, out):
     if corner >= 0:
         d = half_widths[corner]
         u = (s - knots[corner + 1]) / d
-        if order == 0:  # b(u) or its derivative by u
+        if order == 0:  # b(u) or its derivative
             b = 3 / 16 + u / 2 + 3 / 8 * u**2 - u**4 / 16
         elif order == 1:
             b = 1 / 2 + 3 / 4 * u - u**3 / 4

@@ -64,7 +64,7 @@ def test_weights_of_another_robot_or_none_are_refused(data: str, tmp_path: Path)
 def test_command(data: str, tmp_path: Path, said: Said) -> None:
     asked = ("train", "baseline", "reversal", "--data", data, "--out", tmp_path / "out", "--samples", 320)
     assert "samples: 320" in said(0, *asked)
-    assert "is of a run with batch = 16" in said(2, *asked, "--batch-size", 8)
+    assert "belongs to a run with batch = 16, not 8" in said(2, *asked, "--batch-size", 8)
     error = said(2, "train", "baseline", "nonsense", "--data", data, "--out", "x")
     assert "unknown network 'nonsense'; known: completion, model, mpinets, mpnet" in error
 

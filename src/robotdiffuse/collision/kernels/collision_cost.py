@@ -153,7 +153,7 @@ def _subtract_torques(robot, frames, frame, wrench, grad):
 
 @allocation_free(forceinline=True)
 def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
-    """Cost of a row of spheres of group g towards the scene; adds the spheres' forces to `wrench`."""
+    """Cost of a row of spheres of group g against the scene; adds the spheres' forces to `wrench`."""
     # obstacles near the row's bounding sphere
     cost = _ZERO
     boxes = scene.solid_boxes
@@ -187,7 +187,7 @@ def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
             while nearer:
                 nearest[first_lane(nearer)] = k
                 nearer &= nearer - 1
-    # cost of spheres that are nearest to a point of a cloud, then of spheres that are nearest to a solid
+    # cost of the spheres whose nearest obstacle is a point of a cloud, then of those nearest to a solid
     if near_cloud:
         for i in range(robot.row_sizes[row]):
             at = vector_in(centers, i)
@@ -301,7 +301,7 @@ def cost_gradients(robot, scene, q, margin, self_margin):
 def clearances_and_gradients_into(robot, scene, q, limit, margin, work, clearances, gradients):
     """Writes clearances[n, groups] of the moving groups and gradients[n, dof] for the rows of q[n, dof].
 
-    The gradients are those of sqrt(2 cost), where the cost is that of `cost_gradient_at` towards the scene
+    The gradients are those of sqrt(2 cost), where the cost is that of `cost_gradient_at` against the scene
     alone. This is the root of the sum of h^2 over the spheres, where h = max(0, S - D), S is the margin and D
     the signed distance. Because of the root, gradients are about as large as a sphere's distance from the
     joint axes, whether the sphere is at the edge of the margin or deep inside an obstacle. Gradients of the

@@ -7,8 +7,8 @@ spheres, and from the convex meshes where the spheres are too coarse.
 
 Let q be the middle of a piece and dq half of the joint motion from its start to its end. Each configuration
 of the piece is q + d with |d_j| <= D_j, and there is a t in [-1, 1] with |d_j - t dq_j| <= e_j for all j. On
-a straight line e is zero. The second derivative of a point's position p by q_j and q_k, j <= k, is at most
-L_k, the largest distance of the point from the axis of joint k (1 if the joint slides), so
+a straight line e is zero. The second derivative of a point's position p with respect to q_j and q_k, j <= k,
+is at most L_k, the largest distance of the point from the axis of joint k (1 if the joint slides), so
 
     p(q + d) = p(q) + t v + r,   v = J(q) dq,   |r| <= sum_k L_k (e_k + D_k (D_k / 2 + sum_{j<k} D_j)).
 

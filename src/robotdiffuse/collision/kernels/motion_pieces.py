@@ -49,8 +49,8 @@ def travel_along(q, motion_radii):
 
 @kernel()
 def segment_at(travel, at):
-    """The waypoint at which the segment of a place begins (at the end of the motion, the last segment), and
-    the fraction of this segment."""
+    """The waypoint at which the segment that contains a place begins, and the fraction of this segment up to
+    the place. The end of the motion belongs to the last segment."""
     low = min(max(np.searchsorted(travel, at, side="right") - 1, 0), max(len(travel) - 2, 0))
     if low + 1 >= len(travel) or travel[low + 1] <= travel[low]:
         return low, 0.0

@@ -31,12 +31,12 @@ from robotdiffuse.learning.training.losses import LossSettings
 from robotdiffuse.learning.weight_files import NETWORKS
 
 STAGES = ((0.72, 9), (0.90, 4), (1.0, 1))
-"""Stages of a progressive training (`PlannerTraining.progressive`). Each has the share of the training at
+"""Stages of progressive training (`PlannerTraining.progressive`). Each has the share of the training at
 which it ends, and a number of waypoints: in this stage, each token is the mean of a block of so many."""
 
 
 def block_at(fraction: float) -> int:
-    """Waypoints in a block when this fraction of a progressive training is done."""
+    """Waypoints in a block when this fraction of progressive training is done."""
     return next((block for end, block in STAGES if fraction < end), STAGES[-1][1])
 
 

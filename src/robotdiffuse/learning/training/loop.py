@@ -48,11 +48,11 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 class Processes:
-    """The processes of a training. Each process has its own object of this class, and all must call its
+    """The processes of a training run. Each process has its own object of this class, and all must call its
     methods in the same order."""
 
     def __init__(self, device: str | None) -> None:
-        """device: cpu, or cuda, each process on its own device; None: cuda if present.
+        """device: cpu or cuda (each process then uses its own GPU); None: cuda if present, otherwise cpu.
 
         Matrices are multiplied in bf16 on devices that do so fast. Raises InputError if Accelerate is not
         installed, the device is missing, this process has trained on another device, or PyTorch's default
@@ -263,7 +263,7 @@ class TrainingRun:
     def loop(self) -> None:
         """Train to the end. On Ctrl-C or SIGTERM, store a checkpoint and raise KeyboardInterrupt.
 
-        Raises InputError if another training uses the folder, or if the loss diverges.
+        Raises InputError if another run uses the folder, or if the loss diverges.
         """
         threads = torch.get_num_threads()
         torch.set_num_threads(self.settings.threads)
@@ -384,7 +384,9 @@ class TrainingRun:
             return
         self._plot()
         success = validation.success
-        free_share = "" if success is None or math.isnan(success) else f"{success:.1%} of samples free, "
+        free_share = (
+            "" if success is None or math.isnan(success) else f"{success:.1%} of samples collision-free, "
+        )
         console.print(
             f"{self.task.title}: {self.fraction:.1%}, {counted(self.at.samples, 'sample')} in "
             f"{self.at.seconds / 60:.1f} min, loss {self.rows[-1]['loss']:.4f}, "
@@ -414,7 +416,7 @@ class TrainingRun:
             "rows": self.rows,
         }
         states = {"module": self.module.state_dict(), "average": self.average.state_dict()}
-        states |= self.optimizer.state_dict()["state"]  # the moments, by the place of their parameter
+        states |= self.optimizer.state_dict()["state"]  # the moments, by the index of their parameter
         tensors = {
             f"{part}.{name}": tensor.detach().contiguous()
             for part, state in states.items()
@@ -435,10 +437,9 @@ class TrainingRun:
         except ImportError:
             return
         folder = self.out / "tensorboard"
-        shutil.rmtree(
-            folder, ignore_errors=True
-        )  # written anew, so that a resumed run leaves no second curve
-        # without plots, as on a full disk, the training is not lost
+        # all rows are written again, so that a resumed run leaves no second curve
+        shutil.rmtree(folder, ignore_errors=True)
+        # errors in writing the plots, as on a full disk, must not end the run
         with suppress(OSError), SummaryWriter(str(folder)) as writer:
             for row in self.rows:
                 for name in ("learning_rate", "loss", "validation", "success"):
@@ -456,7 +457,7 @@ class TrainingRun:
             self._check_same(notes["settings"] | notes["identity"])
             self.module.load_state_dict(states.pop("module"))
             self.average.load_state_dict(states.pop("average"))
-            moments = {int(place): state for place, state in states.items()}
+            moments = {int(index): state for index, state in states.items()}
             self.optimizer.load_state_dict(self.optimizer.state_dict() | {"state": moments})
             self.at = Position(**notes["at"])
             self.rng.bit_generator.state = notes["random"][self.processes.index]
@@ -470,7 +471,7 @@ class TrainingRun:
         for name, value in now.items():
             if name not in FREE_SETTINGS and before.get(name) != value:
                 raise InputError(
-                    f"{self._file} is of a run with {name} = {before.get(name)!r}, now it is {value!r}; "
+                    f"{self._file} belongs to a run with {name} = {before.get(name)!r}, not {value!r}; "
                     "use another folder, or the same settings"
                 )
 
@@ -488,7 +489,7 @@ def train(task: TrainingTask, out: str) -> dict[str, float]:
 
     The same call continues a run that was interrupted. If torchrun started several processes, all of them
     call this function and get the same result, see `TrainingRun`. Raises InputError if a package is missing,
-    the folder holds a different run, another training uses it, or the loss diverges; and KeyboardInterrupt,
+    the folder holds a different run, another run uses it, or the loss diverges; and KeyboardInterrupt,
     after a checkpoint, on Ctrl-C or SIGTERM.
     """
     need_packages("training", *EXPORT_PACKAGES)  # checked now, not after hours of training
@@ -497,7 +498,8 @@ def train(task: TrainingTask, out: str) -> dict[str, float]:
     if not task.processes.first:
         return task.processes.share(None)
     with run.averaged():
-        if not math.isfinite(task.loss(1.0, run.rng).item()):  # a short run ends before `bad_steps`
+        # a run of fewer steps than `bad_steps` does not notice that it diverged
+        if not math.isfinite(task.loss(1.0, run.rng).item()):
             run.diverged()
         report = task.finish() | {"samples": float(run.at.samples)}
         minutes = round(run.at.seconds / 60, 2)

@@ -11,9 +11,10 @@ Triangles = Float[ndarray, "_ 3 3"]
 
 def split(triangles: Triangles, size: "float | Float[ndarray, 'n']", reach: float = np.inf) -> Triangles:
     """Cut triangles in two at their longest edge until no edge is longer than `size` [m], a number or one per
-    triangle. The cut is in the middle of the edge or, at a narrow end, so that the piece cut off needs no
-    further cut: halving cuts a needle into a number of pieces that grows with its length to the power of 1.6.
-    A triangle is left out if its middle is farther from the origin than its longest edge plus `reach` [m]."""
+    triangle. The cut is in the middle of the edge. In a narrow triangle it is placed so that the piece at the
+    narrow end needs no further cut: with halving alone, the number of pieces of a needle grows with its
+    length to the power of 1.6. A triangle is left out if its middle is farther from the origin than its
+    longest edge plus `reach` [m]."""
     sizes = np.broadcast_to(np.asarray(size, np.float64), len(triangles))
     return _split(np.ascontiguousarray(triangles, np.float64), sizes**2, reach)
 
@@ -52,8 +53,9 @@ def _split(triangles, squares, reach):
         before = edges[(k + 2) % 3]
         shortest_square = min(after, before)
         longest = np.sqrt(longest_square)
-        # Two cut-off lengths at which the cut is within the limit: the projection of the shortest edge, where
-        # the cut is perpendicular, and what the shortest edge leaves of the limit (triangle inequality).
+        # Each of two distances from that end keeps the new edge within the limit: the projection of the
+        # shortest edge (the new edge is perpendicular), and the limit minus the shortest edge (triangle
+        # inequality).
         projection = (shortest_square + longest_square - max(after, before)) / (2 * longest)
         at = max(projection, np.sqrt(limits[t]) - np.sqrt(shortest_square)) / longest
         if shortest_square > limits[t] or 4 * at * at * longest_square < limits[t]:
