@@ -124,6 +124,7 @@ def test_motions_that_are_none() -> None:
         ({"times": [0.0, 1.0], "poses": [STANDS, 2 * STANDS]}, r"sphere.poses\[1\] is .*must be a homogeneous transform"),
     ):
         refuses(message, rd.MovingObstacle, BALL, **motion)
+    refuses("time is nan; it must be a finite number", rd.MovingObstacle(BALL, velocity=[0, 1, 0]).pose, np.nan)
     refuses("point_cloud", rd.MovingObstacle, rd.PointCloud([[0.5, 0, 0.5]]), velocity=[0, 1, 0])
 
 

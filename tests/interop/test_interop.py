@@ -246,6 +246,8 @@ def test_bad_motions_are_refused_in_one_line() -> None:
     refuses(r"times\[1\] is nan", arrays, ["a"], [[0], [1]], [0, np.nan])
     refuses("times do not increase: 1 s in row 0, 1 s", arrays, ["a"], [[0], [1]], [1, 1])
     refuses(r"times span 1.2e\+06 s; a motion must", arrays, ["a"], [[0], [1]], [0, 1.2e6])
+    fast = replace(MOTION, times=1e-12 * MOTION.times)
+    refuses("rows 0 and 1 are less than 1 ns apart", recorded_motion.joint_trajectory, fast)
     refuses("the motion lacks panda_joint1", of_panda, NAMES[1:], [START[1:]])
     finger = [*NAMES, FINGERS[0]]
     told = "has panda_finger_joint1 at 0.01, the problem locks it at 0.04: write `locked: {panda_finger_joint1"

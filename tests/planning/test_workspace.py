@@ -137,10 +137,12 @@ def test_bad_input() -> None:
     refuses("unknown link 'nose'", rd.Workspace, space.robot, tip="nose")
     for step, message in (
         (rd.MoveTo("redy"), "move to: .*'redy'"),
+        (rd.MoveTo("ready", "nose"), "move to: unknown link 'nose'"),
         (rd.Attach("cup", name="grasp"), "grasp: unknown obstacle 'cup'; known: ball"),
         (rd.MoveTo("ready", contacts={"cup": "all"}, name="go"), "go: unknown obstacle in"),
     ):
         refuses(f"step 1 of 1, {message}", space.plan_steps, [step], "ready")
+    refuses("time_limit is -1", space.plan_steps, [rd.MoveTo("ready")], "ready", -1.0)
     refuses("frame is 'base'; it must be 'tip' or 'world'", rd.MoveRelative, [0, 0, 0.1], "base")
     refuses(r"xyz is .*; it must be 3 finite numbers", rd.MoveRelative, [0, 0.1])
 

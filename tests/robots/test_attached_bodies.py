@@ -122,5 +122,6 @@ def test_what_cannot_be_held_is_refused_in_one_line_that_calls_no_held_object_a_
     refuses("no planned joint moves .*; moved links: l1", box_arm().attach, SHAPES[0], box_arm().base)
     refuses("'l2'; it must be a name that no link", box_arm().attach, rd.Sphere([0, 0, 0], 0.1, name="l2"), "l3")
     refuses("'point_cloud' is a point_cloud; it must be", box_arm().attach, rd.PointCloud([[0, 0, 0]]), "l3")
+    refuses("attached.touch_links is 'l2'; it must be a list of names", box_arm().attach, SHAPES[0], "l3", "l2")
     refuses("'tool' already", box_arm().with_tool("l3", np.eye(4)).with_tool, "l3", np.eye(4), name="b")
     refuses("holds ball", box_arm().with_tool("l3", np.eye(4)).attach(SHAPES[0], "tool").detach, "tool")

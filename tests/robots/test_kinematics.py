@@ -97,6 +97,7 @@ def test_inverse_kinematics_of_a_robot_nearest_first() -> None:
     found = panda.ik(panda.fk(q), count=5, near=q)
     assert len(found) == 5 and np.abs(panda.fk(found) - panda.fk(q)).max() < 1e-5
     np.testing.assert_allclose(found[0], q, atol=1e-4)
+    refuses("seed is -1; it must be at least 0", panda.ik, np.eye(4), seed=-1)
     assert panda.ik(transform(np.array([9.0, 0.0, 0.0]))).shape == (0, 7)
     refuses(r"q is .* it must be 7 numbers, or rows of them: panda_joint1", panda.fk, [0.0, 1.0])
     refuses("unknown link 'moon'", panda.jacobian, q, "moon")

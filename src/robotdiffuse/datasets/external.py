@@ -9,7 +9,7 @@ target's position is our interpretation. Both arrays are float32.
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float32
@@ -20,9 +20,10 @@ from robotdiffuse import __version__
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.core.errors import InputError, counted, numbers, reading, shown
-from robotdiffuse.core.input_files import input_file
+from robotdiffuse.core.errors import InputError, check_type, counted, numbers, reading, shown
+from robotdiffuse.core.input_files import file_name, input_file
 from robotdiffuse.core.output_files import check_output, lock_folder, write_atomically
+from robotdiffuse.core.settings import Bound, converted
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.datasets.shards import (
     MANIFEST,
@@ -54,6 +55,7 @@ RESOLUTION = 0.02
 """No point of the arm moves further than this between two checks of the straight line from start to goal
 [m]."""
 WAYPOINTS = 254
+WaypointCount = Annotated[int, Bound(least=2.0)]
 DOF = 7
 CONDITION_NUMBERS = 23
 """Number of values of a condition (a row of `y_train`) in robot.npz."""
@@ -102,8 +104,10 @@ def write_dataset(
         3
     """
     arm = robot if isinstance(robot, Robot) else load_robot(robot)
-    if waypoints < 2:
-        raise InputError(f"waypoints is {waypoints}; it must be at least 2")
+    waypoints = converted("waypoints", WaypointCount, waypoints)
+    target = file_name(folder, "folder")
+    check_type("paths", paths, Iterable, "a list of motions")
+    check_type("scenes", scenes, (Scene, list, tuple), "a rd.Scene, or a list of them")
     motions = [_positions(arm, i, path) for i, path in enumerate(paths)]
     if not motions:
         raise InputError("paths is empty; a data set has at least one motion")
@@ -123,7 +127,7 @@ def write_dataset(
     q = np.stack([resample(motion[None].astype(np.float32), waypoints)[0] for motion in motions])
     about = {"families": {FAMILY: {}}, "floors": {FAMILY: floor}, "slots": slots}
     about["settings"] = {"imported": "write_dataset"}
-    return _write(FilePath(folder), arm, arm.source or arm.name, per_path, q, about)
+    return _write(target, arm, arm.source or arm.name, per_path, q, about)
 
 
 def _write(

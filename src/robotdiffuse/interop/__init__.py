@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.input_files import file_name
 from robotdiffuse.core.output_files import check_output
 from robotdiffuse.core.registry import Entry, Registry
@@ -71,6 +71,11 @@ def write_motion(problem: "Problem", trajectory: "Trajectory", file: str | Path)
 
     Raises InputError as `check_export` does.
     """
+    from robotdiffuse.core.types import Trajectory
+    from robotdiffuse.problems.problem import check_problem
+
+    check_problem(problem)
+    check_type("trajectory", trajectory, Trajectory, "a Trajectory, such as the field of rd.plan's result")
     path = check_export(file)
     if path.suffix.lower() in TRAJECTORY_ENDINGS:
         trajectory.save(path)

@@ -21,7 +21,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
-from robotdiffuse.core.errors import InputError, check_list, check_type, reading, unit_quaternion
+from robotdiffuse.core.errors import InputError, check_list, reading, unit_quaternion
 from robotdiffuse.core.input_files import file_name
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
@@ -37,7 +37,7 @@ from robotdiffuse.interop.ros2 import (
     to_plain,
 )
 from robotdiffuse.perception.depth_view import INTEGER_NO_RETURN, DepthView
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, check_robot
 
 IMAGE = "sensor_msgs/msg/Image"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
@@ -161,7 +161,7 @@ def read_depth_views(
         0.5 s: (48, 64)
     """
     path = file_name(file)
-    check_type("robot", robot, Robot, "a Robot, e.g. rd.load_robot('panda')")
+    check_robot(robot)
     if topics is not None:
         check_list("topics", topics, str, "names of topics")
     if path.suffix == ".db3":

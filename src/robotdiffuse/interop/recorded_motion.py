@@ -319,11 +319,21 @@ def time_message(nanoseconds: int) -> dict[str, int]:
 
 
 def joint_trajectory(trajectory: Trajectory) -> dict[str, Any]:
-    """A trajectory as a trajectory_msgs/msg/JointTrajectory in plain data."""
+    """A trajectory as a trajectory_msgs/msg/JointTrajectory in plain data.
+
+    Raises InputError for rows less than 1 ns apart, which controllers would refuse.
+    """
+    nanoseconds = np.round(1e9 * trajectory.times).astype(int)
+    late = np.flatnonzero(np.diff(nanoseconds) <= 0)
+    if len(late):
+        raise InputError(
+            f"rows {late[0]} and {late[0] + 1} are less than 1 ns apart, which ROS cannot express; resample "
+            "the motion, as --rate does"
+        )
     points = [
         {name: getattr(trajectory, name)[i].tolist() for name in ROWS}
-        | {"effort": [], "time_from_start": time_message(round(t * 1e9))}
-        for i, t in enumerate(trajectory.times.tolist())
+        | {"effort": [], "time_from_start": time_message(at)}
+        for i, at in enumerate(nanoseconds.tolist())
     ]
     header = {"stamp": time_message(0), "frame_id": ""}
     return {"header": header, "joint_names": list(trajectory.joint_names), "points": points}

@@ -14,7 +14,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from robotdiffuse.core.errors import InputError, check_list, check_type
+from robotdiffuse.core.errors import InputError, check_list
 from robotdiffuse.core.transforms import placed, transform
 from robotdiffuse.core.types import Configuration, Points, Pose
 from robotdiffuse.perception.camera_check import (
@@ -27,7 +27,7 @@ from robotdiffuse.perception.camera_check import (
 )
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.visibility import surface_balls
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, check_robot
 
 GATES = np.geomspace(0.15, 0.012, 25)
 """For each round of the estimate, the distance beyond which points are too far from the arm to count [m]."""
@@ -85,7 +85,7 @@ def calibrate_camera(views: Sequence[DepthView], robot: Robot) -> CameraCalibrat
         view = rd.DepthView(image, K, calibration.T_base_camera, pose_deviation=calibration.pose_deviation)
         ```
     """
-    check_type("robot", robot, Robot, "a Robot, e.g. rd.load_robot('panda')")
+    check_robot(robot)
     check_list("views", views, DepthView, "rd.DepthView", least=1)
     each = [(view, q) for view in views if (q := view.configuration) is not None and len(q) == robot.dof]
     if len(each) < len(views):

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float32, Int32
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.errors import InputError, form, numbers, shown
+from robotdiffuse.core.errors import InputError, check_type, form, numbers, shown
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Points, Values, for_kernels
 from robotdiffuse.perception.depth_view import FARTHEST, NEAREST, DepthNoise, DepthView
@@ -336,6 +336,7 @@ def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
         >>> round(rd.measure_noise(images).spread, 3)
         0.002
     """
+    check_type("images", images, (list, tuple, ndarray), "a list of depth images")
     forms = [form(numbers(image)) for image in images]
     if len(forms) < 2 or len({*forms}) > 1 or forms[0].count(" x ") != 1:
         raise InputError(f"images are {shown(forms)}; at least two images of one size, h x w, are needed")

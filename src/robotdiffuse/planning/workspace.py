@@ -28,8 +28,16 @@ from robotdiffuse.planning import plan
 from robotdiffuse.planning.context import PlanRequest, clock, time_left
 from robotdiffuse.planning.pipeline.waypoints import join, one_after_another
 from robotdiffuse.problems.constraints import CartesianLine, Constraint
-from robotdiffuse.problems.problem import AnyGoal, JointGoal, PoseGoal, Problem, StateValidity, goals_of
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.problems.problem import (
+    AnyGoal,
+    JointGoal,
+    PoseGoal,
+    Problem,
+    StateValidity,
+    checked_configuration,
+    goals_of,
+)
+from robotdiffuse.robots.robot import Robot, check_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Shape
 
@@ -81,7 +89,7 @@ class MoveRelative:
         xyz = numbers(self.xyz)
         if xyz is None or xyz.shape != (3,) or not np.isfinite(xyz).all():
             raise InputError(f"{self.name}: xyz is {shown(self.xyz)}; it must be 3 finite numbers [m]")
-        if self.frame not in (TIP, WORLD):
+        if not isinstance(self.frame, str) or self.frame not in (TIP, WORLD):
             raise InputError(f"{self.name}: frame is {shown(self.frame)}; it must be {TIP!r} or {WORLD!r}")
 
 
@@ -187,6 +195,9 @@ def plan_steps(
     check_type("steps", steps, (list, tuple), "a list of steps")
     for i, step in enumerate(steps):
         check_type(f"steps[{i}]", step, Step.__args__, "rd.MoveTo, MoveRelative, Attach or Detach")
+        if isinstance(step, MoveTo | MoveRelative):
+            check_type(f"steps[{i}].contacts", step.contacts, Mapping, "a mapping of obstacles to links")
+    PlanRequest(time_limit)  # raises InputError for a wrong limit, before the limit is divided
     furthest = StepsResult((), (), space, "", 0.0)
     tried_ends = 0
 
@@ -205,7 +216,8 @@ def plan_steps(
                 seconds_left = min(seconds_left, LINE_TIME_LIMIT)
             yield space.plan_line(end, q, step.tolerance, time_limit=seconds_left, **request)
             return
-        space.tip = step.link or space.tip
+        space.tip = space.tip if step.link is None else step.link
+        space.robot.link_frame(space.tip)  # raises InputError for an unknown link
         options = {"constraints": step.constraints, "time_limit": seconds_left, **request}
         result = space.plan(step.goal, q, **options)
         yield result
@@ -311,6 +323,7 @@ class Workspace:
         Raises:
             InputError: For an unknown link, and a pose that is not rigid.
         """
+        check_robot(robot)
         self.robot = robot
         """The robot with its held objects."""
         self.tip = robot.tip if tip is None else tip
@@ -390,7 +403,7 @@ class Workspace:
         self.scene = Scene(self.scene.shapes, contacts)
 
     def attach(
-        self, name: str, q: AnyConfiguration, link: str | None = None, touch_links: Iterable[str] = ()
+        self, name: str, q: AnyConfiguration, link: str | None = None, touch_links: Sequence[str] = ()
     ) -> None:
         """Attach an obstacle to the robot: it becomes a held object, which moves with a link.
 
@@ -407,7 +420,7 @@ class Workspace:
         self._obstacle(name)
         at = self._configuration(q)
         self.scene, self.robot = self.scene.attach(
-            name, self.robot, at, self.tip if link is None else link, tuple(touch_links)
+            name, self.robot, at, self.tip if link is None else link, touch_links
         )
 
     def detach(self, name: str, q: AnyConfiguration) -> None:
@@ -581,10 +594,12 @@ class Workspace:
         line = CartesianLine(self.tip, tolerance, angle, speed)
         PlanRequest(time_limit)  # raises InputError for a wrong limit, before the limit is divided
         began = clock()
-        if len(waypoints):
+        check_type("waypoints", waypoints, Iterable, "a list of poses")
+        stops = [*waypoints]
+        if stops:
             lines = list[PlanResult]()
             q = start
-            ends = [*waypoints, pose]
+            ends = [*stops, pose]
             for k, end in enumerate(ends):
                 seconds_left = time_left(time_limit, began) / (len(ends) - k)
                 result = self.plan_line(end, q, tolerance, angle, speed, seconds_left, **request)
@@ -644,12 +659,12 @@ class Workspace:
         return PoseGoal(self.tip, self._T_base_world @ rigid_transform("goal", goal))
 
     def _configuration(self, q: AnyConfiguration) -> ndarray:
-        return self._problem(Scene(), q).start
+        return checked_configuration(self.robot, "q", q, [])
 
-    def _problem(self, scene: Scene, start: AnyConfiguration | None = None) -> Problem:
-        """A problem that is used for its scene and its start only; its goal is a placeholder."""
+    def _problem(self, scene: Scene) -> Problem:
+        """A problem that is used for its scene only; its start and goal are placeholders."""
         middle = 0.5 * (self.robot.lower + self.robot.upper)
-        return Problem(self.robot, scene, middle if start is None else start, middle)
+        return Problem(self.robot, scene, middle, middle)
 
     def _obstacle(self, name: str) -> Shape:
         for shape in self.scene.shapes:

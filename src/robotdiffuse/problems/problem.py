@@ -51,7 +51,7 @@ from robotdiffuse.problems.constraints import CONSTRAINTS, CartesianLine, Constr
 from robotdiffuse.robots.bodies import Payload
 from robotdiffuse.robots.dynamics import check_dynamics
 from robotdiffuse.robots.kinematic_tree import Joint
-from robotdiffuse.robots.robot import Robot, named_pose
+from robotdiffuse.robots.robot import Robot, check_robot, named_pose
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import ALL_LINKS, Scene
 
@@ -543,9 +543,10 @@ class Problem(Value):
             check_clearance(self.clearance)
         if self.unknown is not None:
             check_unknown("unknown", self.unknown)
-        check_type("robot", self.robot, Robot, "a Robot, e.g. rd.load_robot('panda')")
+        check_robot(self.robot)
         check_type("scene", self.scene, Scene, "a Scene, e.g. rd.Scene([shape, ...])")
         check_contacts(self.robot, self.scene)
+        check_list("notes", self.notes, str, "texts")
         notes = list(self.notes)
         T = self.T_world_base
         checked: dict[str, Any] = {

@@ -53,8 +53,6 @@ def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robo
     """
     check_type("robot", name, (str, PathLike), "its name, or the path of its folder, URDF or MuJoCo model")
     text = str(name)
-    if locked is not None:
-        check_type("locked", locked, dict, "a mapping of joints to values")
     if is_file(Path(name) / ROBOT_FILE):
         robot = _read(Path(name), str(Path(name).resolve()))
     elif names_a_file(name):

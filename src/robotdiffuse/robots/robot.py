@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache, reduce
 from itertools import combinations
@@ -17,7 +17,9 @@ from numpy.typing import ArrayLike
 from robotdiffuse.core.errors import (
     MAX_COORDINATE,
     InputError,
+    check_list,
     check_name,
+    check_type,
     counted,
     numbers,
     rigid_transform,
@@ -25,6 +27,7 @@ from robotdiffuse.core.errors import (
     unknown_name,
     within,
 )
+from robotdiffuse.core.settings import Natural, converted
 from robotdiffuse.core.types import Mask, Pose, Spheres, Value, Values
 from robotdiffuse.robots.bodies import (
     TOOL,
@@ -249,7 +252,7 @@ class Robot(KinematicTree):
 
         Raises:
             InputError: For an unknown link, a link that no planned joint moves, a pose that is not rigid, a
-                count below 1, or a wrong `near`.
+                count below 1, a negative seed, or a wrong `near`.
 
         Examples:
             >>> robot = rd.load_robot("panda")
@@ -258,11 +261,10 @@ class Robot(KinematicTree):
         """
         from robotdiffuse.robots.inverse_kinematics import inverse_kinematics  # compiled code
 
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(converted("seed", Natural, seed))
         near_configuration = None if near is None else configurations(self, near)
-        return inverse_kinematics(
-            self, link or self.tip, cast(ndarray, pose), count, rng=rng, near=near_configuration
-        )
+        name = self.tip if link is None else link
+        return inverse_kinematics(self, name, cast(ndarray, pose), count, rng=rng, near=near_configuration)
 
     def checked_pairs(self) -> tuple[tuple[str, str], ...]:
         """List the pairs of links that are checked against each other.
@@ -294,6 +296,7 @@ class Robot(KinematicTree):
             InputError: For an unknown or fixed joint, a value that is not finite or is farther beyond a limit
                 than the joint's range, or a value of a mimic joint that contradicts the joint that it mimics.
         """
+        check_type("locked", locked, Mapping, "a mapping of joints to values")
         movable = {joint.name: joint for joint in self.joints if joint.kind in MOVING_KINDS}
         for name, value in locked.items():
             check_name("joint in locked", name, movable)
@@ -352,8 +355,8 @@ class Robot(KinematicTree):
             >>> rd.load_robot("panda").attach(cup, "panda_hand").attached[0].name
             'cup'
         """
-        if not hasattr(shape, "solid"):
-            raise InputError(f"attached is {shown(shape)}; it must be a shape, e.g. rd.Box")
+        check_type("attached", shape, RigidShape, "a shape, e.g. rd.Box")
+        check_list("attached.touch_links", touch_links, str, "names of links")
         T_link_body = shape.solid()[0]
         return self.with_body(AttachedBody(shape.name, link, T_link_body, (shape,), tuple(touch_links)))
 
@@ -387,6 +390,8 @@ class Robot(KinematicTree):
         if tools:
             raise InputError(f"tool: the robot has the tool {tools[0]!r} already; detach it first")
         T = rigid_transform("tool.T_link_tool", T_link_tool)
+        check_list("tool.shapes", shapes, RigidShape, "shapes")
+        check_list("tool.touch_links", touch_links, str, "names of links")
         return self.with_body(AttachedBody(name, link, T, tuple(shapes), tuple(touch_links), tool=True))
 
     def with_body(self, body: AttachedBody) -> "Robot":
@@ -404,7 +409,7 @@ class Robot(KinematicTree):
         """
         field = TOOL if body.tool else "attached"
         self.check_moved(f"{field}.link", body.link)
-        if not isinstance(body.name, str) or body.name in self.link_names:
+        if not isinstance(body.name, str) or body.name in ("", *self.link_names):
             raise InputError(
                 f"{field}.name is {shown(body.name)}; it must be a name that no link or held object of "
                 f"{self.name} has"
@@ -447,7 +452,11 @@ class Robot(KinematicTree):
 
         Returns:
             The robot with the world as its base.
+
+        Raises:
+            InputError: For a pose that is not rigid.
         """
+        T_world_base = rigid_transform("T_world_base", T_world_base)
         name = "world"
         while name in self.link_names:
             name += "_"
@@ -578,6 +587,11 @@ def moving_pairs(robot: Robot, names: Container[str]) -> list[tuple[str, str]]:
     """Pairs of links with these names that are fixed to different frames."""
     links = [link for link in robot.link_names if link in names]
     return [(a, b) for a, b in combinations(links, 2) if robot.link_frame(a) != robot.link_frame(b)]
+
+
+def check_robot(robot: object) -> None:
+    """Raises InputError for anything but a Robot."""
+    check_type("robot", robot, Robot, "a Robot, e.g. rd.load_robot('panda')")
 
 
 def configurations(robot: Robot, q: ArrayLike) -> ndarray:

@@ -59,8 +59,8 @@ ROBOT_FILE = "robot.json"
 DATA = Path(__file__).parent / "data"
 ROBOTS = tuple(sorted(file.parent.name for file in DATA.glob(f"*/{ROBOT_FILE}")))
 """Names of the bundled robots."""
-FILE_ENDINGS = (".urdf", ".xacro", ".xml")
-"""Endings of robot descriptions: URDF, xacro and MuJoCo models."""
+FILE_ENDINGS = (".urdf", ".xacro", ".xml", ".sdf", ".usd", ".usda", ".usdc", ".usdz")
+"""Endings of robot descriptions: URDF, xacro and MuJoCo models; also SDF and USD, which are refused."""
 MESH_FILE = "meshes.npz"
 
 

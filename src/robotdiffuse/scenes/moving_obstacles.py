@@ -199,7 +199,13 @@ class MovingObstacle(Value):
 
         Returns:
             The pose [4, 4]; if the motion is unknown, the pose at time 0.
+
+        Raises:
+            InputError: For a time that is not a finite number.
         """
+        at = numbers(time)
+        if at is None or at.ndim or not np.isfinite(at):
+            raise InputError(f"time is {shown(time)}; it must be a finite number [s]")
         times, poses = self.track
         if len(times) == 1:
             return poses[0]
@@ -219,6 +225,9 @@ class MovingObstacle(Value):
 
         Returns:
             The shape; if the motion is unknown, at its pose at time 0.
+
+        Raises:
+            InputError: For a time that is not a finite number.
         """
         return self.shape.moved(self.pose(time) @ inverse(self.shape.T_base_shape))
 

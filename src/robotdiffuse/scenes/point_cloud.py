@@ -18,7 +18,7 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, reading, shown
-from robotdiffuse.core.input_files import input_file, known_ending, read_array, read_bytes
+from robotdiffuse.core.input_files import file_name, input_file, known_ending, read_array, read_bytes
 from robotdiffuse.core.mesh_files import check_ply
 from robotdiffuse.core.types import Points, Vector
 
@@ -171,7 +171,7 @@ def read_points(file: str | Path) -> tuple[Points, tuple[str, ...]]:
     gives an empty array and a note. Raises InputError if the file is missing, has no bytes, or is not a point
     cloud.
     """
-    file = Path(file)
+    file = file_name(file)
     reader = READERS[known_ending(file, "point cloud", READERS)]
     if input_file(file, "point cloud file").stat().st_size == 0:
         raise InputError(f"point cloud file {file} is empty")

@@ -4,14 +4,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace as dataclass_replace
 from functools import cached_property
+from types import NoneType
 from typing import Any
 
 import numpy as np
 
-from robotdiffuse.core.errors import InputError, check_name, counted, joined, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, check_type, counted, joined, shown, unknown_name
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation, transform
 from robotdiffuse.core.types import Configuration, Pose, Value, frozen_dataclass, no_type_check
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, check_robot
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 
 SHOWN_NAMES = 5
@@ -178,6 +179,7 @@ class Scene(Value):
         Raises:
             InputError: For an unknown obstacle, and in the cases in which `Robot.attach` raises it.
         """
+        check_robot(robot)
         obstacles = {shape.name: shape for shape in self.shapes}
         check_name("obstacle to attach:", name, obstacles)
         link = robot.tip if link is None else link
@@ -198,6 +200,7 @@ class Scene(Value):
         Raises:
             InputError: For an unknown name, an object to which a body is attached, and one that is no shape.
         """
+        check_robot(robot)
         robot_without = robot.detach(name)
         [body] = [body for body in robot.attached if body.name == name]
         T_base_link = robot.fk(q, body.link)
@@ -254,6 +257,8 @@ def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
     from robotdiffuse.robots.parsing import mjcf
 
     mujoco = mjcf.imported_mujoco()
+    check_type("model", model, mujoco.MjModel, "a model, e.g. of mujoco.MjModel.from_xml_path(file)")
+    check_type("data", data, (mujoco.MjData, NoneType), "a mujoco.MjData or None")
     if model.nflex:
         flex = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, 0)
         raise InputError(f"flex {flex} is soft; obstacles must be rigid: use geoms in its place")

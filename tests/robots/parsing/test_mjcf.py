@@ -134,6 +134,7 @@ def test_a_scene_is_all_that_is_not_the_robot(file: Path) -> None:
     np.testing.assert_allclose(crate.bounds, [[0.55, -0.1, 0.2], [0.65, 0.3, 0.4]])
     np.testing.assert_allclose(rd.Scene.from_mujoco(model, data, base="base").shapes[0].bounds[1, 2], -0.55)
     refuses("body", rd.Scene.from_mujoco, model, base="bse")
+    refuses("model is 'm.xml'; it must be a model", rd.Scene.from_mujoco, "m.xml")
 
 
 FIELD = '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>'

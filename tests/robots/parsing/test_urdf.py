@@ -100,6 +100,7 @@ def test_bad_arguments_give_one_clear_line(tmp_path: Path) -> None:
     refuses("'wrist'", read_urdf, file, locked={"wrist": 0.0})
     refuses("baxter_left, baxter_right, ", load_robot, "no_such_robot")
     refuses(r"arm\.urdf", load_robot, "nowhere/arm.urdf")
+    refuses(r"arm\.usda is a USD file; robots are read from URDF", load_robot, "arm.usda")
 
 
 def same(a: rd.Robot, b: rd.Robot) -> None:
@@ -161,11 +162,12 @@ def test_limits_file(tmp_path: Path) -> None:
     file = tmp_path / "limits.yaml"
     file.write_text(
         "joint_limits:\n"
-        "  turn: {has_velocity_limits: true, max_velocity: 2, has_jerk_limits: false, max_jerk: 1}\n"
+        "  turn: {has_velocity_limits: true, max_velocity: 2, max_effort: 9, has_jerk_limits: false, max_jerk: 1}\n"
         "  bend: {max_acceleration: 3.5, min_position: -1, has_jerk: false}\n"  # as KUKA's files have it
     )
     robot = with_limits(read_urdf(urdf(tmp_path)), read_limits(file)[0])
     np.testing.assert_allclose(robot.velocity, [2, 1])
+    assert robot.planned_joints[0].effort == 9
     np.testing.assert_allclose(robot.acceleration, [8, 3.5])
     np.testing.assert_allclose(robot.jerk, [80, 35])
     np.testing.assert_allclose(robot.lower, [-2, -1])
@@ -178,6 +180,7 @@ def test_limits_file(tmp_path: Path) -> None:
         ("joint_limits: {turn: {max_speed: 1}}", "'max_speed'"),
         ("joint_limits: {turn: {max_velocity: -1}}", "max_velocity of turn is -1"),
         ("joint_limits: {turn: {max_velocity: 1.0e-300}}", "is 1e-300; it must be a number from 1e-06"),
+        ("joint_limits: {turn: {max_deceleration: 1}}", "set max_acceleration to the smaller of both"),
         ("joint_limits: {wrist: {max_velocity: 1}}", "'wrist'"),
         ("joint_limits: {turn: {min_position: 5}}", "turn: min_position"),
     ):

@@ -76,7 +76,7 @@ from robotdiffuse.planning.exploration.viewpoints import (
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import PADDED, PREDICTED, Goal, JointGoal, Problem
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, check_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.tolerances import VerifySettings, goal_error
 
@@ -126,7 +126,7 @@ class Explorer:
         Raises:
             InputError: For arguments of the wrong type or out of bounds.
         """
-        check_type("robot", robot, Robot, "a Robot, e.g. rd.load_robot('panda')")
+        check_robot(robot)
         check_type("cameras", cameras, (list, tuple), "a list of ArmCamera")
         for i, camera in enumerate(cameras):
             check_type(f"cameras[{i}]", camera, ArmCamera, "an ArmCamera")

@@ -115,6 +115,11 @@ class UrdfTree:
             self.text = with_prefixes(text)
             return parse_xml(self.text, str(self.path))
 
+        if ".usd" in self.path.suffix.lower():
+            raise InputError(
+                f"{self.path} is a USD file; robots are read from URDF, xacro and MuJoCo models (MJCF): "
+                "convert it to one of them"
+            )
         root = parsed(read_bytes(self.path, "URDF"))
         if is_xacro(self.path, root):
             if not self.compile_xacro:
@@ -629,14 +634,15 @@ def _attributes(element: ET.Element, tag: str) -> dict[str, str]:
     return {} if child is None else child.attrib
 
 
-# FIELDS: MoveIt's fields of joint_limits.yaml, and those of `Joint`. FACTORS: MoveIt's fields that are
-# ignored with a note.
+# FIELDS: fields of joint_limits.yaml of MoveIt and ros2_control, and those of `Joint`. FACTORS: MoveIt's
+# fields that are ignored with a note.
 FIELDS = {
     "min_position": "lower",
     "max_position": "upper",
     "max_velocity": "velocity",
     "max_acceleration": "acceleration",
     "max_jerk": "jerk",
+    "max_effort": "effort",
 }
 FACTORS = ("default_velocity_scaling_factor", "default_acceleration_scaling_factor")
 
@@ -645,10 +651,10 @@ def read_limits(file: str | Path) -> tuple[dict[str, dict[str, float]], tuple[st
     """Read limits from a YAML or JSON file. Returns values by joint and by field of `Joint`, and notes.
 
     The file has the form joint_limits: {JOINT: {max_velocity: 2.0}}, with the fields min_position,
-    max_position, max_velocity, max_acceleration and max_jerk. A field is ignored if MoveIt's flag for it,
-    such as has_velocity_limits, is false. Other entries beside joint_limits, such as MoveIt's default scaling
-    factors, are ignored, with a note. Raises InputError for a file without joint_limits, and for unknown
-    fields and wrong values.
+    max_position, max_velocity, max_acceleration, max_jerk and max_effort. A field is ignored if MoveIt's flag
+    for it, such as has_velocity_limits, is false. Other entries beside joint_limits, such as MoveIt's default
+    scaling factors, are ignored, with a note. Raises InputError for a file without joint_limits, and for
+    unknown fields and wrong values.
     """
     data = read_yaml(file, "joint limits")
     joints = data.get("joint_limits") if isinstance(data, dict) else None
@@ -688,12 +694,18 @@ def _fields(file: str, joint: str, entry: object) -> dict[str, float]:
         raise InputError(f"{file}: joint_limits of {joint} is {shown(entry)}; it must be a mapping")
     fields: dict[str, float] = {}
     for key, value in entry.items():
-        if str(key).startswith("has_"):  # MoveIt's flags, such as has_jerk_limits
+        # flags of MoveIt, such as has_jerk_limits
+        if str(key).startswith("has_") or key == "angle_wraparound":
             continue
-        check_name(f"field of {joint} in {file}", key, FIELDS)
-        kind = "position" if key.endswith("position") else key.removeprefix("max_")
+        kind = "position" if str(key).endswith("position") else str(key).removeprefix("max_")
         if entry.get(f"has_{kind}_limits") is False:
             continue
+        if key == "max_deceleration":
+            raise InputError(
+                f"{file}: max_deceleration of {joint} is not supported, since motions brake as hard as they "
+                "accelerate; set max_acceleration to the smaller of both"
+            )
+        check_name(f"field of {joint} in {file}", key, FIELDS)
         max_value = MAX_COORDINATE if kind == "position" else MAX_RATE
         number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= max_value
         if not number or (kind != "position" and value < MIN_RATE):
