@@ -18,8 +18,7 @@ from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
 
 ARM = box_arm()
-WALL = Scene([Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8], name="wall")])
-AROUND = Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None]))
+AROUND = Problem(PANDA, Scene([Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8], name="wall")]), LEFT, JointGoal(RIGHT[None]))
 SPACING = 0.35
 
 

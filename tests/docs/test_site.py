@@ -58,7 +58,6 @@ def test_the_references_have_every_option_and_public_name_and_the_readme_is_shor
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 130
 
 
-DRAWINGS = sorted((ROOT / "docs").rglob("*.svg"))
 BOXES = """[...document.querySelectorAll("text")].map(text => {
     const box = text.getBoundingClientRect();
     return [text.textContent, box.left, box.top, box.right, box.bottom];
@@ -69,7 +68,7 @@ LEADING = 3.0
 
 @pytest.mark.browser
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
-@pytest.mark.parametrize("drawing", DRAWINGS, ids=lambda file: file.name)
+@pytest.mark.parametrize("drawing", sorted((ROOT / "docs").rglob("*.svg")), ids=lambda file: file.name)
 def test_texts_do_not_overlap(drawing: Path, tmp_path: Path) -> None:
     source = drawing.read_text(encoding="utf-8")
     assert 'font-family="Helvetica, Arial, sans-serif"' in source

@@ -96,7 +96,6 @@ WORKS: dict[str, tuple[Callable[[Path], Path], int]] = {
 }
 """What is made, and how many joints are planned."""
 FLOATING = link("body") + joint("free", "base", "body", "floating")
-NOTHING = "<robot name='bare'><link name='base'/></robot>"
 NO_NUMBERS = b"v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 2 3 4\n"
 REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "a missing mesh": (arm(ARM, ending("a.stl")), "mesh file 'a.stl' does not exist; add it"),
@@ -107,7 +106,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "no limits": (arm(chain("base", ["j"], limits="")), "j: no <limit lower= upper=>; add it"),
     "an endless motion": (text(robot(ARM).replace('velocity="2"', 'velocity="1e-300"')), "at least 1e-06"),
     "a vector of two numbers": (text(robot(ARM).replace('"0 0 0.1"', '"0 0"')), "origin xyz is '0 0'"),
-    "no joint": (text(NOTHING), "no movable joint .*choose another --base or --tip"),
+    "no joint": (text("<robot name='bare'><link name='base'/></robot>"), "no movable joint .*choose another --base or --tip"),
     "loose links": (arm(ARM, link("loose")), r"2 \(base, loose\); connect them with fixed joints"),
     "an empty file": (text(""), "not well-formed XML"),
     "an MJCF file without a robot": (text("<mujoco/>"), "has no robot: no body is moved"),

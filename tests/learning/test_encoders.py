@@ -29,9 +29,8 @@ from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.scenes.scene_arrays import SPHERE
 from robotdiffuse.scenes.surface_points import PANDA_REGION
 
-SMALL_CAE = encoders.CompressionAutoencoderSettings(code=8, cloud=40, hidden=(32, 16))
 SMALL = {
-    "compression_autoencoder": SMALL_CAE,
+    "compression_autoencoder": encoders.CompressionAutoencoderSettings(code=8, cloud=40, hidden=(32, 16)),
     "point_autoencoder": encoders.PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12),
     "pointnet": encoders.PointNetSettings(
         code=8, cloud=32, first=(8, 12), second=(12, 24), transform=(8, 8), transform_head=(8,), head=(16,)
@@ -41,7 +40,6 @@ SMALL = {
 }
 ALONE = [name for name, entry in encoders.ENCODERS.items() if entry.kind == "alone"]
 every_encoder = pytest.mark.parametrize("name", encoders.ENCODERS)
-with_weights = pytest.mark.parametrize("name", [name for name in encoders.ENCODERS if name != "points"])
 
 
 def small(name, seed=0):
@@ -107,7 +105,7 @@ def test_points_out_of_the_region_do_not_count(name):
     np.testing.assert_array_equal(encoder.near(both)[:, :-1], PANDA_REGION.holds(both.numpy())[:, :-1])
 
 
-@with_weights
+@pytest.mark.parametrize("name", [name for name in encoders.ENCODERS if name != "points"])
 def test_gradients_reach_every_parameter(name):
     """Some clouds are empty, and one has fewer points than neighbors; nevertheless no gradient may be NaN."""
     encoder = small(name)

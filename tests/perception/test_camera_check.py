@@ -151,7 +151,6 @@ def test_the_pose_is_estimated_from_views_of_the_arm() -> None:
 
 FLOOR = rd.Box((0, 0, -0.05), (4, 4, 0.1), name="floor")
 TABLES = rd.Scene([FLOOR, rd.Box((0.6, 0.1, 0.1), (0.2, 0.3, 0.2)), rd.Box((0.2, -0.6, 0.2), (0.3, 0.1, 0.4))])
-PROBLEM = rd.Problem(PANDA, TABLES, HOME, HOME)
 NOISE = DepthNoise(spread=0.004, correlation=1.5, missing=0.01, zeros=True)
 STATED = (0.005, float(np.radians(1.0)))
 WIDE = (460.0, 460.0, 319.5, 239.5)
@@ -193,7 +192,7 @@ def test_errors_of_poses_are_found_again(seed: int) -> None:
     before = displaced(misplaced(standing, 10 + seed), standing)[1]
     assert (error < stated).all() and stated.max() < 0.7 * before.max(), "by the arm and the floor in one image"
     for turn in TURNS:
-        true = taken(PROBLEM, CAMERA, HOME + turn, NOISE, rng)
+        true = taken(rd.Problem(PANDA, TABLES, HOME, HOME), CAMERA, HOME + turn, NOISE, rng)
         error, stated = displaced(poses.observe(misplaced(true, 20 + seed)), true)
         assert (error < stated).all()
     assert error.max() < 0.005 and stated.max() < 0.012, "of the camera on the arm"

@@ -23,12 +23,10 @@ from robotdiffuse.scenes.surface_points import VisibleRegion, sample_surface
 
 PANDA = load_robot("panda")
 BASE = np.array([[0, 0, 0.1, 0.15], [-0.1, 0, 0.05, 0.1]])
-every_family = pytest.mark.parametrize("name", FAMILIES)
-every_target = pytest.mark.parametrize("target", [drawing.CONFIGURATION, *TARGETS])
 
 
-@every_target
-@every_family
+@pytest.mark.parametrize("target", [drawing.CONFIGURATION, *TARGETS])
+@pytest.mark.parametrize("name", FAMILIES)
 def test_problems_are_as_the_family_says(name: str, target: str) -> None:
     family = load_family(name)
     rng = np.random.default_rng(8)

@@ -21,8 +21,7 @@ from robotdiffuse.robots.robot import robot_fingerprint
 from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.scenes.surface_points import draw
 
-rng = np.random.default_rng(0)
-CLOUD = rng.normal(size=(40, 3)) * [0.05, 0.03, 0.1]
+CLOUD = np.random.default_rng(0).normal(size=(40, 3)) * [0.05, 0.03, 0.1]
 STICK = box_mesh(np.zeros(3), np.array([0.3, 0.02, 0.02]))
 SOLIDS = {
     "cube": box_mesh(np.full(3, -0.02), np.full(3, 0.02)),

@@ -22,7 +22,6 @@ BALL = rd.Sphere([1.15, 0.0, 0.0], 0.1, "ball")
 WALL = rd.Box([0.9, 0.6, 0.0], [0.05, 0.4, 0.4], name="wall")
 FINGERS = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
 HOME = np.array([0.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
-AWAY = np.array([1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 
 
 class SolidOnly:
@@ -44,7 +43,7 @@ def grasp(kind: str, contacts: dict[str, object]) -> rd.Problem:
         "point_cloud": rd.PointCloud(made.vertices + at, 0.02, name="mug"),
     }
     scene = rd.Scene([shapes[kind], rd.Sphere([0.62, 0.33, 0.5], 0.1, "ball")], contacts)  # type: ignore[arg-type]
-    return rd.Problem(robot, scene, HOME, AWAY)
+    return rd.Problem(robot, scene, HOME, np.array([1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]))
 
 
 @pytest.mark.parametrize("kind", ["box", "mesh", "point_cloud"])

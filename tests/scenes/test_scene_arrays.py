@@ -14,8 +14,6 @@ from robotdiffuse.problems.families.rop import ROP_DENSE
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 from robotdiffuse.scenes.surface_points import PANDA_REGION
 
-FLOOR = rd.Box([0, 0, -0.05], [2, 2, 0.1], name="floor")
-
 
 def dense_scenes(n: int, seed: int = 5) -> list[rd.Scene]:
     """Dense scenes with a floor, with all boxes turned at random."""
@@ -24,7 +22,7 @@ def dense_scenes(n: int, seed: int = 5) -> list[rd.Scene]:
     for _ in range(n):
         shapes = ROP_DENSE.scene(rng).shapes[1:]
         turned = [rd.Box(s.center, s.size, rng.normal(size=4)) if isinstance(s, rd.Box) else s for s in shapes]
-        scenes.append(rd.Scene([FLOOR, *turned]))
+        scenes.append(rd.Scene([rd.Box([0, 0, -0.05], [2, 2, 0.1], name="floor"), *turned]))
     return scenes
 
 

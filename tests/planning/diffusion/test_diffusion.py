@@ -18,8 +18,7 @@ from robotdiffuse.learning.weight_files import RobotIdentity, weights_for
 from robotdiffuse.planning.diffusion import Diffusion, DiffusionSettings, encode
 from robotdiffuse.scenes.surface_points import sample_surface
 
-BALL = rd.Sphere([0.5, 0.0, 0.4], 0.15, name="ball")
-PROBLEM = rd.Problem(PANDA, rd.Scene([BALL]), LEFT, rd.JointGoal(RIGHT[None]))
+PROBLEM = rd.Problem(PANDA, rd.Scene([rd.Sphere([0.5, 0.0, 0.4], 0.15, name="ball")]), LEFT, rd.JointGoal(RIGHT[None]))
 MODEL = Diffusion().network(PANDA)
 
 

@@ -22,7 +22,6 @@ from robotdiffuse.trajectories.timing_kernel import rounded_line
 SPEED = 0.4
 PERIOD = 0.02
 FLOOR = rd.Box([0, 0, -0.06], [2, 2, 0.1], name="floor")
-UPRIGHT = rd.AxisCone("panda_hand", [0, 0, 1], [0, 0, -1], 0.2)
 
 
 def balls(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -163,7 +162,7 @@ def test_replanners_that_cannot_begin() -> None:
         ({"moving": []}, r"problem\.moving is empty"),
         ({"start": [0, 1.5, 0, -0.5, 0, 2.1, 0.8]}, "the replanner cannot begin: the start is in collision"),
         ({"waypoints": [GOAL]}, r"does not support problem\.waypoints"),
-        ({"constraints": [UPRIGHT]}, r"does not support problem\.constraints"),
+        ({"constraints": [rd.AxisCone("panda_hand", [0, 0, 1], [0, 0, -1], 0.2)]}, r"does not support problem\.constraints"),
         ({"payload": rd.Payload(0.5, link="panda_hand")}, r"does not support problem\.payload"),
     ):
         refuses(message, rd.Replanner, replace(problem, **fields))

@@ -66,11 +66,8 @@ def test_head_wheels_and_a_branch_along_the_arm_are_held(tmp_path: Path) -> None
     assert robot.locked.keys() == {"wheel_1", "wheel_2", "pan", "tilt", "lid"}
 
 
-TWO_ARMS = chain("base", row("left_", 7)), chain("base", row("right_", 7)), chain("base", ["head"])
-
-
 def test_two_arms_are_listed_and_asked_about(tmp_path: Path) -> None:
-    file = written(tmp_path, *TWO_ARMS)
+    file = written(tmp_path, *chain("base", row("left_", 7)), chain("base", row("right_", 7)), chain("base", ["head"]))
     arms = r"has 2 arms: left \(7 joints to left_7_link\), right \(7 joints to right_7_link\)"
     assert "--group left" in refuses(arms, read_urdf, file)
     for group in ("right", "right_7_link"):

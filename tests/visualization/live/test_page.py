@@ -20,7 +20,6 @@ from robotdiffuse.visualization.live.page import Page
 from robotdiffuse.visualization.live.server import PageServer, free_port
 
 VALID = "[data-validity=valid]"
-INVALID = "[data-validity=invalid]"
 pytestmark = MARKS
 
 
@@ -58,7 +57,7 @@ def test_an_obstacle_in_the_way_turns_it_red_and_the_next_plan_green(view: Any, 
     q = motion.trajectory.positions[len(motion.trajectory.times) // 2]
     hand = transform(session.state.problem.robot.fk(q, "panda_hand")[:3, 3])
     session.change_obstacle("sphere", lambda shape: live.moved_to(shape, hand))
-    red = view.locator(INVALID)
+    red = view.locator("[data-validity=invalid]")
     red.wait_for()
     assert "inside sphere" in red.inner_text() and "at 0." in red.inner_text()
     assert session.state.motion is motion
