@@ -16,7 +16,6 @@ NEEDS |= {"scene_code": ("accelerate", "matplotlib", "zarr"), "server": ("fastap
 APART = {"robustness", "scene_code", "server", "startup", "urdf_import"}
 """They start or measure processes, or train on other shapes of inputs. For the others, a process would load all code again."""
 REPORTS = FOLDER / "results"
-NO_SCRIPT = "no longer kept"
 
 
 @pytest.mark.slow
@@ -43,7 +42,7 @@ def test_usages_and_reports_name_their_scripts() -> None:
     """The first line of a report names the script that prints it, or says that this is no longer kept."""
     assert not [name for name in SCRIPTS if f"python benchmarks/{name}.py" not in (FOLDER / f"{name}.py").read_text()]
     firsts = {file.name: file.read_text().partition("\n")[0] for file in REPORTS.glob("*.txt")}
-    made = (*(f"benchmarks/{name}.py" for name in SCRIPTS), NO_SCRIPT)
+    made = (*(f"benchmarks/{name}.py" for name in SCRIPTS), "no longer kept")
     assert not {name: first for name, first in firsts.items() if not any(by in first for by in made)}
 
 

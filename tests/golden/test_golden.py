@@ -13,7 +13,6 @@ from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.held_out import held_out_problem
 
 GOLDEN = Path(__file__).with_name("golden.json")
-PROBLEMS = 8
 
 
 def numbers_of(record: object) -> Iterator[float]:
@@ -25,7 +24,7 @@ def numbers_of(record: object) -> Iterator[float]:
 
 
 def digest(family: str) -> dict[str, float]:
-    problems = [held_out_problem(family, i) for i in range(PROBLEMS)]
+    problems = [held_out_problem(family, i) for i in range(8)]
     flat = np.array([number for problem in problems for number in numbers_of(problem_record(problem))])
     flat = np.nan_to_num(flat, nan=-1e3, posinf=1e3, neginf=-1e3)
     direction = np.random.default_rng(0).standard_normal(len(flat))

@@ -17,13 +17,15 @@ from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.weight_files import RobotIdentity
 
+SMALL_ENCODER = PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12)
+
 
 def small_model(seed: int = 0) -> MotionNetwork:
     """A model for the arm of boxes, with random weights in the last layer too."""
     torch.manual_seed(seed)
     settings = MotionModelSettings(
         waypoints=16,
-        encoder_settings=PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12),
+        encoder_settings=SMALL_ENCODER,
         denoiser_settings=TransformerSettings(width=16, layers=2, heads=2, hidden=32, patch=4),
     )
     model = MotionNetwork(RobotIdentity.of(box_arm()), settings)

@@ -126,8 +126,7 @@ def test_a_pixel_that_saw_nothing_in_range_is_free_and_one_without_return_says_n
 
 @pytest.mark.parametrize("depth", [0.0, np.nan, np.inf])
 def test_a_covered_or_broken_camera_says_nothing_beside_another_one(depth: float) -> None:
-    """Regression: beside a good view, one of zeros lowered the confidence from 0.96 to 0.92, and one of infinite depths made
-    hidden space free."""
+    """Regression: a view of zeros lowered the confidence of a good one, and one of infinite depths made hidden space free."""
     alone = observe([view(flat(WALL))], PANDA, AWAY)
     both = observe([view(flat(WALL)), view(flat(depth))], PANDA, AWAY)
     assert (both.free == alone.free).all() and (both.unknown == alone.unknown).all() and (both.lost == alone.lost).all()

@@ -35,8 +35,6 @@ from robotdiffuse.validation.report import Report, Violation
 from robotdiffuse.validation.validator import Verifier
 
 GOAL = HOME + np.array([1.2, 0.3, 0.0, 0.4, 0.0, 0.0, 0.0])
-OTHER_ARGUMENTS = ("self", "problem", "planner", "settings")
-"""Arguments of `plan` that are not of the request."""
 
 
 @pytest.fixture(params=PLANNERS)
@@ -79,7 +77,7 @@ def test_weights_are_for_learned_planners_alone(name: str) -> None:
 def test_plan_takes_the_fields_of_a_request() -> None:
     request = [(field.name, field.default) for field in fields(PlanRequest)]
     arguments = list(inspect.signature(rd.plan).parameters.values())
-    arguments = [argument for argument in arguments if argument.name not in OTHER_ARGUMENTS]
+    arguments = [argument for argument in arguments if argument.name not in ("self", "problem", "planner", "settings")]
     assert [(argument.name, argument.default) for argument in arguments] == request
 
 

@@ -241,8 +241,7 @@ def test_calls_while_the_first_process_starts_wait_for_it() -> None:
 
 
 def test_a_process_that_cannot_start_is_said(worker: Worker, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Regression: with too many processes, commands said that their output could not be written; in a worker of
-    multiprocessing.Pool, results said AssertionError."""
+    """Regression: commands said that their output could not be written; in a worker of a pool, results said AssertionError."""
     for error in (BlockingIOError(11, "Resource temporarily unavailable"), AssertionError("daemonic")):
         start = Mock(side_effect=error)
         monkeypatch.setattr("multiprocessing.context.SpawnProcess.start", start)

@@ -21,13 +21,12 @@ from robotdiffuse.robots.robot import robot_fingerprint
 from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.scenes.surface_points import draw
 
-CLOUD = np.random.default_rng(0).normal(size=(40, 3)) * [0.05, 0.03, 0.1]
 STICK = box_mesh(np.zeros(3), np.array([0.3, 0.02, 0.02]))
 SOLIDS = {
     "cube": box_mesh(np.full(3, -0.02), np.full(3, 0.02)),
     "box": box_mesh(np.array([-0.03, -0.03, -0.1]), np.array([0.03, 0.03, 0.1])),
     "tray": box_mesh(np.array([-0.2, -0.15, -0.005]), np.array([0.2, 0.15, 0.005])),
-    "stone": convex_hull(CLOUD),
+    "stone": convex_hull(np.random.default_rng(0).normal(size=(40, 3)) * [0.05, 0.03, 0.1]),
     "tilted": convex_hull(STICK.vertices @ rotation_about(np.array([1.0, 2.0, 3.0]) / np.sqrt(14), 0.7)),
 }
 SHAPES = [
