@@ -66,7 +66,7 @@ def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
     assert first["skipped"] == 1 and first["samples"] == 20
     files = [out / part / "model.safetensors" for part in ("whole", "parts")]
     assert files[0].read_bytes() == files[1].read_bytes()
-    refuses("processes = '2', now it is '1'", train_planner, settings, str(out / "parts"))
+    refuses("processes = '2', not '1'", train_planner, settings, str(out / "parts"))
     draw = Batches.draw
     gradients = {}
 
@@ -230,7 +230,7 @@ def test_other_settings_and_a_damaged_checkpoint_are_refused(tmp_path, data):
     out = str(tmp_path / "out")
     train_planner(planner_settings(data, samples=16), out)
     again = train_planner, planner_settings(data), out
-    refuses(r"learning_rate = 0\.003, now it is 0\.1", train_planner, planner_settings(data, learning_rate=0.1), out)
+    refuses(r"learning_rate = 0\.003, not 0\.1", train_planner, planner_settings(data, learning_rate=0.1), out)
     with lock_folder(tmp_path / "out"):
         refuses("another process", *again)
     file = tmp_path / "out" / "training.safetensors"
