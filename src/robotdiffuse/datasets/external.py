@@ -55,7 +55,6 @@ RESOLUTION = 0.02
 """No point of the arm moves further than this between two checks of the straight line from start to goal
 [m]."""
 WAYPOINTS = 254
-WaypointCount = Annotated[int, Bound(least=2.0)]
 DOF = 7
 CONDITION_NUMBERS = 23
 """Number of values of a condition (a row of `y_train`) in robot.npz."""
@@ -104,7 +103,7 @@ def write_dataset(
         3
     """
     arm = robot if isinstance(robot, Robot) else load_robot(robot)
-    waypoints = converted("waypoints", WaypointCount, waypoints)
+    waypoints = converted("waypoints", Annotated[int, Bound(least=2.0)], waypoints)
     target = file_name(folder, "folder")
     check_type("paths", paths, Iterable, "a list of motions")
     check_type("scenes", scenes, (Scene, list, tuple), "a rd.Scene, or a list of them")

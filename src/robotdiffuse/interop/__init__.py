@@ -8,9 +8,9 @@ from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.input_files import file_name
 from robotdiffuse.core.output_files import check_output
 from robotdiffuse.core.registry import Entry, Registry
+from robotdiffuse.core.types import Trajectory
 
 if TYPE_CHECKING:
-    from robotdiffuse.core.types import Trajectory
     from robotdiffuse.interop.recorded_motion import RecordedMotion
     from robotdiffuse.problems.problem import Problem
 
@@ -65,13 +65,12 @@ def check_export(file: str | Path, *inputs: str) -> Path:
     return check_output(path, (*TRAJECTORY_ENDINGS, *WRITERS), *inputs)
 
 
-def write_motion(problem: "Problem", trajectory: "Trajectory", file: str | Path) -> None:
+def write_motion(problem: "Problem", trajectory: Trajectory, file: str | Path) -> None:
     """Write a motion and its problem in the format of the file's ending, one of WRITERS or
     TRAJECTORY_ENDINGS.
 
     Raises InputError as `check_export` does.
     """
-    from robotdiffuse.core.types import Trajectory
     from robotdiffuse.problems.problem import check_problem
 
     check_problem(problem)
