@@ -10,6 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
+import coal
 import numpy as np
 import pytest
 import trimesh
@@ -22,7 +23,7 @@ from trimesh.exchange.ply import export_ply
 
 from helpers.refusals import refuses
 from robotdiffuse import Box, InputError, Scene
-from robotdiffuse.core import input_files
+from robotdiffuse.core import files
 from robotdiffuse.core.errors import MAX_WORD, OutputError, distinct, joined, located, shown, unknown_name
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.types import check_motion_arrays
@@ -51,14 +52,14 @@ def one_line(call: Callable[[], object]) -> str:
 
 
 MALFORMED: dict[Callable[[Any, str], object], tuple[tuple[str | bytes, str], ...]] = {
-    input_files.parse_json: (
+    files.parse_json: (
         ("[" * DEEP, "more than 64 levels deep"),
         ('"' + "[" * DEEP, "is not valid JSON"),
         ("9" * 5000, "integer 9999"),
         ("[1, 2", "line 1, column 6"),
         ('{"a": {"b": 1, "b": 2}}', "b appears twice"),
     ),
-    input_files.parse_yaml: (
+    files.parse_yaml: (
         ("[" * DEEP, "more than 64 levels deep"),
         ("- " * DEEP, "more than 64 levels deep"),
         ("? " * DEEP, "a key is not a plain string"),
@@ -73,7 +74,7 @@ MALFORMED: dict[Callable[[Any, str], object], tuple[tuple[str | bytes, str], ...
         ("\0", "is not valid YAML"),
         ("\ud800", "surrogate"),
     ),
-    input_files.parse_xml: (
+    files.parse_xml: (
         (b"<a>" * DEEP + b"</a>" * DEEP, "more than 64 levels deep"),
         (b'<?xml version="1.0" encoding="klingon"?><robot/>', "unknown encoding"),
         (b"", "no element found"),
@@ -93,15 +94,15 @@ def test_text_that_is_malformed_nested_too_deep_or_a_bomb(parse: Callable[[Any, 
 
 def test_brackets_in_texts_are_no_nesting() -> None:
     value = ["[" * 500, '\\"{' * 500, {"a": [[1]]}]
-    assert input_files.parse_json(json.dumps(value), "it") == value
+    assert files.parse_json(json.dumps(value), "it") == value
 
 
 def test_what_yaml_means() -> None:
     text = "{a: 1e-3, b: [0x10, -2, yes, ~, 1:30, 2001-13-45], c: &x {d: .inf}, e: *x, f: '1', g: 1.5e3}"
     meant = {"a": 0.001, "b": [16, -2, True, None, 90, "2001-13-45"], "f": "1", "g": 1500.0}
-    assert input_files.parse_yaml(text, "it") == meant | {"c": {"d": np.inf}, "e": {"d": np.inf}}
-    assert input_files.parse_yaml("", "it") is None
-    assert input_files.parse_yaml("{1: a, on: b, ~: c}", "it") == {"1": "a", "on": "b", "~": "c"}
+    assert files.parse_yaml(text, "it") == meant | {"c": {"d": np.inf}, "e": {"d": np.inf}}
+    assert files.parse_yaml("", "it") is None
+    assert files.parse_yaml("{1: a, on: b, ~: c}", "it") == {"1": "a", "on": "b", "~": "c"}
 
 
 values = st.recursive(
@@ -112,8 +113,8 @@ values = st.recursive(
 
 @given(values)
 def test_what_is_written_is_read_back(value: object) -> None:
-    assert input_files.parse_json(json.dumps(value), "it") == value
-    assert input_files.parse_yaml(yaml.dump(value, Dumper=yaml.CSafeDumper), "it") == value
+    assert files.parse_json(json.dumps(value), "it") == value
+    assert files.parse_yaml(yaml.dump(value, Dumper=yaml.CSafeDumper), "it") == value
 
 
 @given(st.binary(max_size=200))
@@ -121,7 +122,7 @@ def test_any_bytes_are_a_value_or_one_line(content: bytes) -> None:
     text = content.decode("latin-1")
     for parse in MALFORMED:
         try:
-            parse(text.encode() if parse is input_files.parse_xml else text, "it")
+            parse(text.encode() if parse is files.parse_xml else text, "it")
         except InputError as error:
             assert "\n" not in str(error)
 
@@ -146,14 +147,14 @@ def test_files_that_are_none(tmp_path: Path) -> None:
         ("\ud800", "not a valid file name"),
         ("x" * 1000, "File name too long"),
     ]:
-        assert message in one_line(lambda file=file: input_files.read_text(file, "robot file"))
-    assert not any(map(input_files.is_file, (pipe, link, tmp_path, "a\0b", "\ud800", "x" * 1000)))
+        assert message in one_line(lambda file=file: files.read_text(file, "robot file"))
+    assert not any(map(files.is_file, (pipe, link, tmp_path, "a\0b", "\ud800", "x" * 1000)))
     with pytest.MonkeyPatch.context() as patch:
         closed.touch()
         patch.setattr(os, "access", lambda *_: False)  # root may read everything
-        assert "permission denied" in one_line(lambda: input_files.input_file(closed))
+        assert "permission denied" in one_line(lambda: files.input_file(closed))
     long = tmp_path / ("y" * 200)
-    assert str(long) in one_line(lambda: input_files.input_file(long)) or len(str(long)) > MAX_WORD
+    assert str(long) in one_line(lambda: files.input_file(long)) or len(str(long)) > MAX_WORD
 
 
 def test_a_broken_mesh_and_one_that_asks_for_memory_are_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -202,10 +203,10 @@ def test_a_pipe_that_a_mesh_file_names_is_not_waited_for(kind: str, tmp_path: Pa
 def test_arrays_of_python_objects_are_refused(tmp_path: Path) -> None:
     for name, save in (("points.npy", np.save), ("points.npz", np.savez)):
         save(tmp_path / name, np.array([{"a": 1}], object))
-        refuses("is damaged", input_files.read_arrays, tmp_path / name)
+        refuses("is damaged", files.read_arrays, tmp_path / name)
     # an archive called .npy was returned unread and open
     np.savez(tmp_path / "points.npz", points=np.zeros(3))
-    refuses("is damaged", input_files.read_arrays, (tmp_path / "points.npz").rename(tmp_path / "points.npy"))
+    refuses("is damaged", files.read_arrays, (tmp_path / "points.npz").rename(tmp_path / "points.npy"))
 
 
 def test_errors_keep_their_kind_and_their_lines_where_they_are_copied_or_located() -> None:
@@ -239,13 +240,9 @@ def test_nothing_unpickles_files() -> None:
 
 
 @given(st.lists(st.floats(allow_nan=False), min_size=1, max_size=3), st.integers(2, 6))
-def test_different_numbers_are_told_apart(values: list[float], digits: int) -> None:
+def test_different_numbers_are_told_apart_by_few_digits(values: list[float], digits: int) -> None:
     assert len(set(distinct(*values, digits=digits))) >= len(set(values))
-
-
-def test_as_few_digits_as_needed() -> None:
-    assert distinct(3.14, 9.0) == ["3.14", "9"]
-    assert distinct(3.1400001049, 3.14) == ["3.1400001", "3.14"]
+    assert (distinct(3.14, 9.0), distinct(3.1400001049, 3.14)) == (["3.14", "9"], ["3.1400001", "3.14"])
 
 
 COUNT = 2000
@@ -296,9 +293,9 @@ def collada(
     return folder / "part.dae"
 
 
-def corners(file: Path, notes: list[str] | None = None) -> ndarray:
+def corners(file: Path, notes: list[str] | None = None, turn: bool = True) -> ndarray:
     """The corners by their distance from the origin."""
-    vertices, _ = read_triangles(file, notes=notes)
+    vertices, _ = read_triangles(file, notes=notes, turn=turn)
     return vertices[np.argsort(np.linalg.norm(vertices, axis=1))]
 
 
@@ -310,24 +307,24 @@ def test_collada_is_read_in_meters(tmp_path: Path) -> None:
     refuses("its unit is '0' m", read_triangles, collada(tmp_path, "0"))
 
 
-def test_the_up_axis_of_collada_becomes_z(tmp_path: Path) -> None:
-    for up, expected in (
+@pytest.mark.parametrize(
+    ("up", "expected"),
+    [
         ("Z_UP", [[1, 0, 0], [0, 2, 0], [0, 0, 3]]),
         ("Y_UP", [[1, 0, 0], [0, 0, 2], [0, -3, 0]]),
         ("X_UP", [[0, 0, 1], [-2, 0, 0], [0, -3, 0]]),
-    ):
-        notes: list[str] = []
-        np.testing.assert_allclose(corners(collada(tmp_path, up=up), notes), expected, atol=1e-12, err_msg=up)
-        assert len(notes) == (up != "Z_UP")
-
-
-def test_gltf_stands_upright(tmp_path: Path) -> None:
-    """Regression: a wall of 1 x 2 x 0.1 m, given with y up as in glTF, lay flat."""
-    trimesh.creation.box([1, 2, 0.1]).export(tmp_path / "wall.glb")
+        ("glTF", [[1, 0, 0], [0, 0, 2], [0, -3, 0]]),
+    ],
+)
+def test_the_up_axis_becomes_z_but_not_of_links(up: str, expected: list[list[int]], tmp_path: Path) -> None:
+    """Regressions: a wall in glTF lay flat; links of PR2, TIAGo and Kinova's Jaco were turned, unlike in Coal and RViz."""
+    trimesh.Trimesh(np.diag([1, 2, 3]), [[0, 1, 2]]).export(tmp_path / "part.glb")
+    file = tmp_path / "part.glb" if up == "glTF" else collada(tmp_path, up=up)
     notes: list[str] = []
-    vertices, _ = read_triangles(tmp_path / "wall.glb", notes=notes)
-    np.testing.assert_allclose(np.ptp(vertices, axis=0), [1, 0.1, 2])
-    assert "y up" in notes[0]
+    np.testing.assert_allclose(corners(file, notes), expected, atol=1e-12)
+    assert len(notes) == (up != "Z_UP")
+    link = coal.MeshLoader().load(str(file), np.ones(3))  # type: ignore[attr-defined]
+    np.testing.assert_allclose(corners(file, turn=False), link.vertices(), atol=1e-12)
 
 
 def test_a_missing_material_loses_no_geometry(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Loading does not count as time of a call, but preparing a scene does; Ctrl-C ends programs."""
 
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -13,12 +14,23 @@ from helpers.panda import LEFT, PANDA, RIGHT
 from helpers.waiting import stop_clock
 from robotdiffuse.collision import exact_meshes, kernel_arrays
 from robotdiffuse.core.deadline import LONG, OutOfTimeError, check_time, check_timing, deadline
+from robotdiffuse.core.interrupts import delay_interrupts
 from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.core.loading import compile_seconds, compiled, loading, loading_seconds
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.search.rrt import RRTConnect
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.trajectories import speed_limits
+
+
+def test_a_delayed_signal_survives_an_error() -> None:
+    """Regression: if the block raised, Ctrl-C was lost."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs ignore it
+    with pytest.raises(KeyboardInterrupt), delay_interrupts():
+        signal.raise_signal(signal.SIGINT)
+        raise ValueError
+    signal.signal(signal.SIGINT, before)
+
 
 FIRST_CALLS = """
 import sys, time

@@ -16,7 +16,7 @@ from helpers.box_arm import box_arm
 from helpers.refusals import refuses
 from robotdiffuse import Problem, Scene, Trajectory, load_planner, verify
 from robotdiffuse.core.errors import OutputError
-from robotdiffuse.core.output_files import JsonLines, write_atomically
+from robotdiffuse.core.files import JsonLines, write_atomically
 from robotdiffuse.core.types import ROWS
 from robotdiffuse.validation.rates import rate_violations
 from robotdiffuse.validation.validator import VerifySettings
@@ -85,8 +85,8 @@ def test_what_cannot_be_written_is_refused(solved: rd.PlanResult, tmp_path: Path
     refuses("nowhere does not exist", solved.save, tmp_path / "nowhere" / "r.json")
     (tmp_path / "folder.json").mkdir()
     refuses("is a folder", solved.save, tmp_path / "folder.json")
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        replace(solved, min_clearance=float("nan")).save(tmp_path / "r.json")
+    for wrong, problem in ((replace(solved, min_clearance=float("nan")), None), (solved, {"start": np.zeros(7)})):
+        refuses("r.json: JSON holds texts, .*finite numbers only: .*JSON", wrong.save, tmp_path / "r.json", problem)
     assert [path.name for path in tmp_path.iterdir()] == ["folder.json"]
 
 
@@ -101,7 +101,7 @@ def test_a_failed_write_keeps_the_old_file(error, raised, solved, tmp_path, monk
 
 
 DAMAGE = [
-    ({"status": "fine"}, "status is 'fine'; known: solved, timeout"),
+    ({"status": "fine"}, "unknown status 'fine'; known: error, invalid_goal"),
     ({"verified": False}, "verified is False, but status is 'solved'"),
     ({"times": [0.0, 0.1, 0.1, 0.2]}, "times do not increase: 0.1 s in row 1, 0.1 s in row 2"),
     ({"times": ["0", "0.1", "0.2", "0.3"]}, r"times is \['0', .*; it must be 4 finite numbers, one"),
@@ -185,12 +185,11 @@ def pulse(step: float = 0.004, count: int = 6) -> Trajectory:
     half = np.concatenate([np.arange(count), np.arange(count, 0, -1)])
     a = 2.0 * np.concatenate([half, -half, [0]])[:, None] * np.array([[1.0, 0.5, -1.0]]) / count
     v = np.concatenate([np.zeros((1, 3)), np.cumsum((a[1:] + a[:-1]) / 2 * step, axis=0)])
-    moved = step * (v[1:] + v[:-1]) / 2 - step**2 * (a[1:] - a[:-1]) / 12
-    q = np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)])
+    q = np.concatenate([np.zeros((1, 3)), np.cumsum(step * (v[1:] + v[:-1]) / 2 - step**2 * (a[1:] - a[:-1]) / 12, axis=0)])
     return Trajectory(("a", "b", "c"), step * np.arange(len(a)), q, v, a)
 
 
-def test_a_cubic_is_exact_at_any_time():
+def test_a_cubic_is_exact_at_any_time_and_other_times_and_rates_are_refused():
     rough = cubic()
     fine = cubic(101)
     state = rough.at(fine.times)
@@ -200,9 +199,6 @@ def test_a_cubic_is_exact_at_any_time():
     one = rough.at(0.7)
     assert one.jerks.shape == one.positions.shape == (3,)
     assert np.allclose(one.positions, rough.at(np.array([0.7])).positions[0])
-
-
-def test_times_outside_and_rates_that_are_not_positive_are_refused():
     for time in (-0.1, 2.1, np.nan, np.array([0.5, 3.0])):
         refuses(r"it must be in \[0, 2\]", cubic().at, time)
     for rate in (0, -5, np.inf, np.nan, 1e12):
@@ -256,3 +252,11 @@ def test_a_trajectory_of_one_row_rests_there():
     assert (state.positions == motion.positions[:1]).all() and not state.jerks.any()
     assert one.at(0.0).positions.shape == (3,)
     assert len(one.resample(500).times) == 1
+
+
+def test_links_are_written_through_and_impossible_names_refused(tmp_path: Path) -> None:
+    (tmp_path / "latest.json").symlink_to(tmp_path / "run.json")
+    write_atomically(tmp_path / "latest.json", "new")
+    assert (tmp_path / "latest.json").is_symlink() and (tmp_path / "run.json").read_text() == "new"
+    for name in ("a\0.json", "\ud800.json"):
+        refuses("not a valid file name", rd.Trajectory(("joint",), np.zeros(1), *[np.zeros((1, 1))] * 3).save, name)

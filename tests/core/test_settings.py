@@ -94,6 +94,7 @@ def test_assignments_and_those_that_are_wrong() -> None:
     refuses("'step' is not NAME=VALUE", Search().changed, ["step"])
     refuses("search.step is 'big'; it takes a number above 0", Search().changed, ["step=big"])
     refuses("search.greedy is 1; it takes true or false", Search().changed, ["greedy=1"])
+    refuses("search.step is 10+...; it must be within ±1e308", Search().replaced, {"step": 10**309})
 
 
 def test_descriptions() -> None:
@@ -165,3 +166,9 @@ def test_entries_of_installed_packages_are_loaded_when_they_are_used(tmp_path: P
     refuses("known: gone, pear, plum, stone", installed.entry, "apple")
     refuses("drupe gone: its entry point no_such_module:GONE cannot be loaded", installed.entry, "gone")
     refuses("orchard:STONE is 1; it must be an Entry", installed.load_installed)
+
+
+def test_settings_of_a_class_without_source() -> None:
+    names = {"Settings": Settings, "dataclass": dataclass, "__name__": "typed"}
+    exec("@dataclass(frozen=True)\nclass Typed(Settings):\n    step: float = 1.0\n", names)
+    assert names["Typed"]().changed(["step=2"]).step == 2  # type: ignore[operator]

@@ -117,7 +117,6 @@ middle = (panda.lower + panda.upper) / 2
 problem = rd.Problem(panda, rd.Scene([]), middle, middle)
 path = rd.Path(panda.joint_names, np.array([middle]))
 of_lists, of_none = rd.Path(panda.joint_names, [[0.0] * 7]), rd.Path(None, path.positions)
-still = rd.Trajectory(panda.joint_names, None, path.positions, path.positions, path.positions)
 motion = rd.Trajectory(panda.joint_names, np.arange(2.0), *3 * [np.zeros((2, 7))])
 calls = {
     "plan": rd.plan,
@@ -146,11 +145,18 @@ calls = {
     "Replanner": rd.Replanner,
     "show": rd.show,
     "RopDataset": rd.RopDataset,
+    "PlanResult.record": rd.PlanResult(rd.Status.TIMEOUT, "", "", "", 0.0, 0).record,
+    "Trajectory": lambda wrong: rd.Trajectory(panda.joint_names, wrong, *3 * [np.zeros((2, 7))]),
     "trajectory.at": motion.at,
     "trajectory.resample": motion.resample,
+    "Scene": rd.Scene,
+    "Scene: may_touch": lambda wrong: rd.Scene().may_touch(wrong, wrong),
+    "Problem.in_world: scene": lambda wrong: rd.Problem.in_world(np.eye(4), panda, wrong, middle, middle),
+    "attach": lambda wrong: panda.attach(wrong, "panda_hand"),
+    "Workspace.remove": rd.Workspace(panda).remove,
 }
 for name, call in calls.items():
-    for wrong in (None, -1.5, "x", b"x", [], {"a": 1}, np.zeros(2), rd.plan, of_lists, of_none, still):
+    for wrong in (None, -1.5, "x", b"x", [], {"a": 1}, np.zeros(2), np.array(0.1), rd.Box, rd.plan, of_lists, of_none):
         try:
             call(wrong)
             print(name, repr(wrong), "is taken")
@@ -159,20 +165,25 @@ for name, call in calls.items():
                 print(name, repr(wrong), "is more than a line")
         except Exception as error:
             print(name, repr(wrong), type(error).__name__, error)
-try:
-    rd.plan("shelf.yaml")
-except rd.InputError as error:
-    print(error)
+lists = panda.joint_names, [0, 1], *2 * [[[0] * 7] * 2]
+print(rd.Trajectory(*lists, [[0] * 7] * 2).resample(1).record() == motion.record())
+for wrong in (lambda: rd.plan("shelf.yaml"), lambda: rd.Trajectory(*lists, np.zeros((2, 6)))):
+    try:
+        wrong()
+    except rd.InputError as error:
+        print(error)
 """
 
 
 def test_arguments_of_the_wrong_type_are_one_line() -> None:
     ended = python(CALLS)
-    rightly = ["plan_many []", *(f"load_planner: {what} None" for what in ("settings", "weights"))]
-    at = "trajectory.at []", "trajectory.at array([0., 0.])"
-    taken = [f"{call} is taken" for call in (*rightly, "load_robot: locked -1.5", *at)]
-    right = "problem is 'shelf.yaml'; it must be a Problem: rd.load_problem('shelf.yaml') reads one from a file"
-    assert (ended.stdout.splitlines(), ended.stderr) == ([*taken, right], "")
+    rightly = ["plan_many []", *(f"load_planner: {what} None" for what in ("settings", "weights")), "load_robot: locked -1.5"]
+    rightly += ["PlanResult.record None", "PlanResult.record {'a': 1}", "Trajectory array([0., 0.])", "trajectory.at []"]
+    rightly += ["trajectory.at array([0., 0.])", "trajectory.at array(0.1)", "Scene []", "Scene: may_touch 'x'"]
+    taken = [f"{call} is taken" for call in rightly]
+    named = "problem is 'shelf.yaml'; it must be a Problem: rd.load_problem('shelf.yaml') reads one from a file"
+    rows = "accelerations is an array of 2 x 6; it must be 2 x 7 finite numbers, a column for each joint"
+    assert (ended.stdout.splitlines(), ended.stderr) == ([*taken, "True", named, rows], "")
 
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])

@@ -6,8 +6,8 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 
 LONG = 0.2
-"""A step shorter than this [s] begins as long as any time is left. Timing (the time parameterization) may
-exceed the time limit by up to this."""
+"""A step shorter than this [s] begins as long as any time is left. Such a step of timing (the time
+parameterization) may begin up to this long after the time limit."""
 _remaining: ContextVar[Callable[[], float] | None] = ContextVar("remaining", default=None)
 _cancel_check: ContextVar[Callable[[], None] | None] = ContextVar("cancel_check", default=None)
 # Work for which too little time is left; the words end the message "the time limit is too short ...".
@@ -56,7 +56,7 @@ def check_cancelled() -> None:
 
 
 def check_timing(step: str, seconds: float = 0.0) -> None:
-    """`check_time` for a step of timing, which may run up to LONG past the time limit.
+    """`check_time` for a step of timing, which may begin up to LONG after the time limit.
 
     Planners reserve time for timing (`PlanningContext.search_until`), so timing rarely exceeds the limit. The
     overrun allows a planner to return a path that was found late.

@@ -1,5 +1,5 @@
-"""InputError, the exception for bad input; helpers that quote values in its message; and checks of the
-numbers that users give, which raise it.
+"""InputError, the exception for bad input; helpers that quote values in its message; and checks of numbers
+from users, which raise it.
 
 The checks convert numbers to arrays within bounds that all other code can handle."""
 
@@ -69,8 +69,8 @@ def located(where: object) -> Iterator[None]:
 
 @contextmanager
 def reading(file: object) -> Iterator[None]:
-    """As `located`, for reading a file. Any exception other than InputError becomes an InputError that says
-    that the file is damaged."""
+    """Does what `located` does, for reading a file. Any exception other than InputError becomes an InputError
+    that says that the file is damaged."""
     try:
         with located(file):
             yield
@@ -93,9 +93,9 @@ def needs(package: str, extra: str) -> Iterator[None]:
 
 
 def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:
-    """Raises InputError unless the value is an instance of `kind`. The message says that it must be
-    `wanted`."""
-    if not isinstance(value, kind):
+    """Raises InputError unless the value is an instance of `kind`. A class never counts as an instance, even
+    if `kind` is a protocol whose members it has. The message says that the value must be `wanted`."""
+    if isinstance(value, type) or not isinstance(value, kind):
         raise InputError(f"{what} is {shown(value)}; it must be {wanted}")
 
 
@@ -210,16 +210,24 @@ RIGID_SLACK = 1e-4
 """Largest allowed error of a pose matrix: of each entry of R R^T against the identity, and of each entry of
 the last row against LAST_ROW."""
 MOTION_SLACK = 1e-3
-"""Like RIGID_SLACK, for motions, which are often products of poses."""
+"""RIGID_SLACK for the arguments of `moved`; larger, since these are often products of poses."""
+ROUNDED = 1e-6
+"""A rotation that is off by more than this, as RIGID_SLACK counts, is replaced by the nearest exact one;
+otherwise products of poses with few decimals would exceed the slack."""
 LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 
 
-def numbers(value: object) -> ndarray | None:
+def numbers(value: Any) -> ndarray | None:
     """The value as a float64 array; None if it is not a number or nested lists of numbers."""
     try:
+        if hasattr(value, "detach"):  # a tensor of PyTorch, which may have gradients
+            value = value.detach().cpu()
         # what a mask hides is missing
         array = value.filled(np.nan) if isinstance(value, np.ma.MaskedArray) else np.asarray(value)
-    except (TypeError, ValueError, OverflowError, RuntimeError):  # PyTorch refuses tensors with gradients so
+        if array.dtype == object:  # as a row of a table of numbers and texts
+            value = array.tolist()
+            array = np.asarray(value)
+    except (TypeError, ValueError, OverflowError, RuntimeError):
         return None
     return array.astype(np.float64) if array.dtype.kind in "iuf" and not _holds_boolean(value) else None
 
@@ -236,11 +244,13 @@ def within(array: ndarray, most: float = MAX_COORDINATE) -> bool:
     return bool((np.abs(array) <= most).all())
 
 
-def vector(owner: str, name: str, value: object, size: int, most: float = MAX_COORDINATE) -> ndarray:
-    """The value as `size` numbers within ±most. Raises InputError, naming owner.name, for anything else."""
+def vector(owner: str, name: str, value: object, size: int | None, most: float = MAX_COORDINATE) -> ndarray:
+    """The value as `size` numbers (None: at least one) within ±most. Raises InputError, naming owner.name,
+    for anything else."""
     array = numbers(value)
-    if array is None or array.shape != (size,) or not within(array, most):
-        rule = f"it must be {size} finite numbers within ±{most:g}"
+    count = size if size is not None or array is None else max(array.size, 1)
+    if array is None or array.shape != (count,) or not within(array, most):
+        rule = f"it must be {'n' if size is None else size} finite numbers within ±{most:g}"
         raise InputError(f"{owner}.{name} is {shown(value)}; {rule}")
     return array
 
@@ -313,7 +323,8 @@ def unit_quaternion(owner: str, value: object, name: str = "wxyz") -> ndarray:
 
 
 def rigid_transform(what: str, value: object, slack: float = RIGID_SLACK) -> ndarray:
-    """The value as a 4 x 4 pose, with the last row set to exactly 0 0 0 1.
+    """The value as a 4 x 4 pose, with the last row set to exactly 0 0 0 1, and a rotation that is off by more
+    than ROUNDED replaced by the nearest exact one.
 
     Raises InputError, naming `what`, for other shapes, for numbers beyond ±MAX_COORDINATE, for a reflection,
     and if an entry of R R^T or of the last row is off by more than `slack`.
@@ -331,6 +342,9 @@ def rigid_transform(what: str, value: object, slack: float = RIGID_SLACK) -> nda
             f"{what} is {shown(T)}, with the determinant {handedness:.3g} and the last row {shown(T[3])}; it"
             " must be a homogeneous transform: a rotation matrix (determinant 1), last row 0 0 0 1"
         )
+    if off > ROUNDED:
+        u, _, v = np.linalg.svd(rotation)
+        T[:3, :3] = u @ v
     T[3] = LAST_ROW
     return T
 
@@ -342,7 +356,9 @@ def rigid_motion(T: object) -> ndarray:
 
 def form(array: ndarray | None) -> str:
     """The shape of an array in words, for error messages."""
-    return "not numbers" if array is None else f"an array of {' x '.join(map(str, array.shape))}"
+    if array is None:
+        return "not numbers"
+    return f"an array of {' x '.join(map(str, array.shape))}" if array.ndim else "a single number"
 
 
 MAX_NUMBERS = 8

@@ -1,22 +1,27 @@
-"""How Ctrl-C ends programs, and how they exit."""
+"""How Ctrl-C and other signals end programs, and how they exit."""
 
 import atexit
 import os
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any, NoReturn
+
+STOPS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+"""Signals that end a program: Ctrl-C, `kill` and batch systems, a terminal that is closed."""
 
 
 @contextmanager
 def handled(handler: Callable[[int, Any], None], *signals: int) -> Iterator[None]:
-    """Within the block, signals call the handler. Threads other than the main thread, which signals do not
-    reach, change nothing."""
-    if threading.current_thread() is not threading.main_thread():
-        signals = ()
-    before = {number: signal.signal(number, handler) for number in signals}
+    """Within the block, signals call the handler, except signals that are ignored, as Ctrl-C is by background
+    jobs, or that code in C handles. Signals reach only the main thread; in any other thread, the block
+    changes nothing."""
+    before = {}
+    with suppress(ValueError):  # in another thread
+        for number in signals:
+            if signal.getsignal(number) not in (signal.SIG_IGN, None):
+                before[number] = signal.signal(number, handler)
     try:
         yield
     finally:
@@ -26,30 +31,31 @@ def handled(handler: Callable[[int, Any], None], *signals: int) -> Iterator[None
 
 @contextmanager
 def delay_interrupts() -> Iterator[None]:
-    """Delay Ctrl-C until the end of the block."""
-    caught: list[int] = []
-    with handled(lambda number, _frame: caught.append(number), signal.SIGINT):
-        yield
-    if caught:
-        signal.raise_signal(signal.SIGINT)
+    """Delay signals that end the program until the end of the block."""
+    caught = list[int]()
+    try:
+        with handled(lambda number, _: caught.append(number), *STOPS):
+            yield
+    finally:
+        for number in caught:
+            signal.raise_signal(number)
 
 
 def exit_on_interrupt(tidy: Callable[[], None] = lambda: None) -> AbstractContextManager[None]:
-    """Within the block, Ctrl-C calls `tidy` and exits with status 130 at once; for work that can stop
-    anywhere.
+    """Within the block, a signal of STOPS calls `tidy` and exits at once, with status 130 after Ctrl-C; for
+    work that can stop anywhere.
 
     The usual KeyboardInterrupt would be lost in callbacks while compiled code is loaded, and some packages
     mistake it for an import error.
     """
 
-    def stop(*_: object) -> None:
+    def stop(number: int, _: object) -> None:
         with suppress(Exception):
             tidy()
             print("robotdiffuse: stopped", file=sys.stderr, flush=True)
-        os._exit(130)
+        os._exit(128 + number)
 
-    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    return nullcontext() if ignored else handled(stop, signal.SIGINT)
+    return handled(stop, *STOPS)
 
 
 def exit_fast(run: Callable[[], int]) -> NoReturn:
@@ -73,6 +79,6 @@ def exit_fast(run: Callable[[], int]) -> NoReturn:
     except SystemExit:  # with a status of its own
         atexit.unregister(leave)
         raise
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+    if os.environ.get("WORLD_SIZE", "1") != "1":
         leave()
     sys.exit(status)

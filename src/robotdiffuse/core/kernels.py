@@ -111,8 +111,8 @@ def _folder_name(module: str) -> str:
 
 
 def _compiled_from(module: str) -> set[str]:
-    """The modules with code or constants that are compiled into a module: itself, its imports in the package,
-    the imports of each of these that imports `core.kernels`, and so on."""
+    """The modules with code or constants that are compiled into a module: itself and the modules of the
+    package that it imports; of these, each that imports `core.kernels` is followed in the same way."""
     modules: set[str] = set()
     waiting = [module]
     while waiting:
@@ -266,7 +266,7 @@ def inner_kernel(**options: Any) -> Callable[[Callable], Any]:
 
 
 def allocation_free(
-    fastmath: bool = False, inline: str = "never", forceinline: bool = False, inner: bool = True
+    fastmath: bool | set[str] = False, inline: str = "never", forceinline: bool = False, inner: bool = True
 ) -> Callable[[Callable], Any]:
     """A decorator that compiles a function without Numba's reference counting; an inner kernel by default.
 

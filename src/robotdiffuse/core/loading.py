@@ -78,7 +78,6 @@ def compile_note() -> str:
     """A note for users on this thread's compile time; empty if nothing was compiled since the last note."""
     if _clock.compiling == _clock.noted:
         return ""
+    took = _clock.compiling - _clock.noted
     _clock.noted = _clock.compiling
-    return (
-        f"compiled for {_clock.compiling:.1f} s, once on this machine; this is not part of the planning time"
-    )
+    return f"compiled for {took:.1f} s, once on this machine; this is not part of the planning time"

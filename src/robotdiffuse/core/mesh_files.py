@@ -13,7 +13,7 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, reading, shown
-from robotdiffuse.core.input_files import (
+from robotdiffuse.core.files import (
     MAX_DEPTH,
     MAX_FILE_SIZE,
     input_file,
@@ -51,20 +51,22 @@ logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 def read_triangles(
-    file: str | Path, merge: bool = False, notes: list[str] | None = None
+    file: str | Path, merge: bool = False, notes: list[str] | None = None, turn: bool = True
 ) -> tuple[ndarray, ndarray]:
-    """Vertices [v, 3] and faces [f, 3] of a mesh file, with z up.
+    """Vertices [v, 3] and faces [f, 3] of a mesh file.
 
-    Collada is converted to meters by its <unit>; vertices of other formats keep the units of the file. glTF,
-    which has y up, and Collada files with another <up_axis> than z are rotated so that z is up.
+    Collada is converted to meters by its <unit>; vertices of other formats keep the units of the file.
 
     Args:
         file: A file with an ending in MESH_FORMATS. Materials and images are not read.
         merge: Whether vertices with equal coordinates are merged.
-        notes: Receives a note if the mesh is rotated or scaled.
+        notes: Receives a note on an up axis other than z, and if the mesh is scaled.
+        turn: Whether glTF, which has y up, and Collada files with another <up_axis> than z are rotated so
+            that z is up. MoveIt, RViz for ROS 1 and Pinocchio do not rotate them, and URDFs rely on that.
 
     Raises:
-        InputError: For files that `input_file` refuses, other formats, and empty or damaged files.
+        InputError: For files that `input_file` refuses, other formats, pointers of Git LFS, and files that
+            are empty or damaged, hold no triangles or are too large in memory.
     """
     path = input_file(file, "mesh file")
     ending = known_ending(path, "mesh", MESH_FORMATS)
@@ -75,33 +77,41 @@ def read_triangles(
         raise InputError(f"mesh file {file} is a pointer of Git LFS; get the file itself: git lfs pull")
     import trimesh  # takes seconds; files refused above are refused at once
 
-    options: dict[str, Any] = {}
+    resolver = None
     up = "Z_UP"
     meters = 1.0
     with reading(f"mesh file {file}"):
         if ending == ".dae":
             content, up, meters = _collada(content)
-            options = {"ignore_broken": False}
         elif ending in (".glb", ".gltf"):
             up = "Y_UP"
             _check_accessors(content)
-            options = {"resolver": _buffer_resolver(path)}
-        if ending in (".glb", ".gltf", ".obj"):
-            options["skip_materials"] = True
+            resolver = _buffer_resolver(path)
         if ending == ".ply":
             check_ply(content)
         with np.errstate(all="ignore"):
-            mesh = trimesh.load_mesh(io.BytesIO(content), ending[1:], process=merge, **options)
+            mesh = trimesh.load_mesh(
+                io.BytesIO(content),
+                ending[1:],
+                resolver,
+                process=merge,
+                skip_materials=True,
+                ignore_broken=False,
+            )
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError(f"mesh file {file} holds no triangles")
     if mesh.vertices.shape[1:] != (3,):
         raise InputError(f"mesh file {file} cannot be read: its vertices do not have three coordinates")
     if notes is not None and up != "Z_UP":
-        notes.append(f"{path.name} has {up[0].lower()} up; it is turned to z up")
+        notes.append(
+            f"{path.name} has {up[0].lower()} up; it is turned to z up"
+            if turn
+            else "meshes whose files state another up axis than z are not turned, as in MoveIt"
+        )
     if notes is not None and meters != 1:
         notes.append(f"{path.name} is in units of {meters:g} m; it is read in meters")
     vertices = meters * np.asarray(mesh.vertices, np.float64)
-    return vertices @ R_UP[up].T, np.asarray(mesh.faces, np.int64)
+    return vertices @ R_UP[up if turn else "Z_UP"].T, np.asarray(mesh.faces, np.int64)
 
 
 def check_ply(content: bytes) -> None:
@@ -119,7 +129,8 @@ def check_ply(content: bytes) -> None:
 def _collada(content: bytes) -> tuple[bytes, str, float]:
     """A Collada file without materials and images, its up axis, and its unit [m].
 
-    Raises InputError for unknown up axes and units, and for a scene that would not fit into memory.
+    Raises InputError for unknown up axes and units, for a scene or a list of polygons that would not fit into
+    memory, and for nodes that are nested too deeply or contain themselves.
     """
     root = parse_xml(content, "it")
     for element in root.iter():
@@ -137,7 +148,7 @@ def _collada(content: bytes) -> tuple[bytes, str, float]:
     if up not in R_UP:
         raise InputError(f"its up_axis is {shown(up)}; it must be one of {', '.join(R_UP)}")
     if not 1e-9 < meters < 1e9:
-        raise InputError(f"its unit is {shown(unit_text)} m; it must be a positive number")
+        raise InputError(f"its unit is {shown(unit_text)} m; it must be a number between 1e-9 and 1e9")
     if any(sum(map(int, (count.text or "").split())) > len(content) for count in root.iter("vcount")):
         raise InputError("a list of polygons has more corners than the file has bytes")
     sizes = {

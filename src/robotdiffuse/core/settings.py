@@ -13,6 +13,7 @@ import ast
 import dataclasses
 import inspect
 import math
+import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -23,10 +24,10 @@ from types import UnionType
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from robotdiffuse.core.errors import InputError, shortened, shown, suggestion, unknown_name
-from robotdiffuse.core.input_files import parse_yaml
+from robotdiffuse.core.files import parse_yaml
 from robotdiffuse.core.registry import Registry
 
-Given = TypeVar("Given", bound="Settings")
+SettingsT = TypeVar("SettingsT", bound="Settings")
 LONG = 40
 """Longest value shown in lists of settings [characters]."""
 
@@ -42,14 +43,14 @@ class Bound:
     infinite: bool = False
 
     def problem(self, value: Any) -> str | None:
-        """What the value must be but is not, such as "at least 1"; None if it is within the bounds."""
+        """The rule that the value breaks, such as "at least 1"; None if it breaks none."""
         within = (
             (self.above is None or value > self.above)
             and (self.least is None or value >= self.least)
             and (self.below is None or value < self.below)
             and (self.most is None or value <= self.most)
         )
-        if not within or value != value:
+        if not within or value != value:  # NaN differs from itself
             return "positive" if self.rule == "above 0" else self.rule or "finite"
         return "finite" if math.isinf(value) and not self.infinite else None
 
@@ -64,13 +65,11 @@ class Bound:
 
     @property
     def rule(self) -> str:
-        low = f"at least {self.least:g}" if self.least is not None else ""
-        low = f"above {self.above:g}" if self.above is not None else low
-        high = f"at most {self.most:g}" if self.most is not None else ""
-        high = f"below {self.below:g}" if self.below is not None else high
+        """The bounds in words, such as "above 0 and at most 1"; empty without bounds."""
         if self.least is not None and self.most is not None:
             return f"between {self.least:g} and {self.most:g}"
-        return " and ".join(part for part in (low, high) if part)
+        bounds = {"at least": self.least, "above": self.above, "at most": self.most, "below": self.below}
+        return " and ".join(f"{word} {bound:g}" for word, bound in bounds.items() if bound is not None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +89,14 @@ class Filled:
 
 @dataclass(frozen=True)
 class SettingsOf:
-    """Marks a field with the settings of the registry entry that another field names: `denoiser_settings`
-    holds the settings of the entry whose name is in the field `denoiser`.
+    """The value must be the settings of a registry entry. Another field holds the name of this entry: the
+    mark of `denoiser_settings` has the field "denoiser" and the registry of denoisers.
 
-    The value is None if the other field holds something else than a name of the registry, such as a folder.
+    The value is None if the other field does not hold a name in the registry, but for example a folder.
     """
 
     field: str
+    """Name of the other field."""
     table: Registry
 
 
@@ -120,9 +120,9 @@ KINDS = {
     tuple: "a list",
     dict: "values by name",
 }
-"""Types of settings in messages."""
+"""What messages call the types of settings."""
 CLASSES = {int: Integral, float: Real, tuple: (list, tuple), Any: object}
-"""Classes of the values that a type takes, if others than the type itself."""
+"""For types of fields that accept values of other classes too: the accepted classes."""
 UNIONS = (Union, UnionType)
 
 
@@ -132,7 +132,7 @@ class Setting(NamedTuple):
     name: str
     """Dotted for a field of settings within settings."""
     default: Any
-    """The present value, which is the default unless the setting was changed."""
+    """The value in the described settings: the default, unless it was changed there."""
     rule: str
     """Allowed values."""
     description: str
@@ -179,7 +179,7 @@ class Settings:
         return dataclasses.asdict(self)  # type: ignore[call-overload]
 
     @classmethod
-    def from_json(cls: type[Given], values: object, where: str) -> Given:
+    def from_json(cls: type[SettingsT], values: object, where: str) -> SettingsT:
         """Make settings of the values that `to_json` returned.
 
         Args:
@@ -203,7 +203,8 @@ class Settings:
         for name, field in fields.items():
             if name in values:
                 at = f"{where}.{name}"
-                # if the value is None, the other field may hold a folder, which is not in the registry
+                # None needs no class: the field that `SettingsOf` names then holds a folder, which has no
+                # registry entry.
                 kind = None if values[name] is None else _settings_class(hints[name], values, fields)
                 if kind is not None:
                     checked[name] = kind.from_json(values[name], at)
@@ -213,7 +214,7 @@ class Settings:
                 raise InputError(f"{where}.{name} is missing")
         return cls(**checked)
 
-    def changed(self: Given, assignments: Iterable[str]) -> Given:
+    def changed(self: SettingsT, assignments: Iterable[str]) -> SettingsT:
         """Replace some settings, given as on the command line.
 
         Args:
@@ -243,7 +244,7 @@ class Settings:
             values[name] = parsed
         return self.replaced(values)
 
-    def replaced(self: Given, values: Mapping[str, Any]) -> Given:
+    def replaced(self: SettingsT, values: Mapping[str, Any]) -> SettingsT:
         """Replace some settings.
 
         Args:
@@ -259,7 +260,7 @@ class Settings:
         assignments = [setting.assignment for setting in self.describe()]
         return self._replaced(values, self.settings_name, assignments)
 
-    def _replaced(self: Given, values: Mapping[str, Any], where: str, known: list[str]) -> Given:
+    def _replaced(self: SettingsT, values: Mapping[str, Any], where: str, known: list[str]) -> SettingsT:
         hints = _hints(type(self))
         replaced = {}
         nested_changes = dict[str, dict[str, Any]]()
@@ -269,6 +270,7 @@ class Settings:
             if nested and (dot or isinstance(value, Mapping)):
                 nested_changes.setdefault(first, {}).update({rest: value} if dot else value)
             elif nested or name not in hints:
+                # "diffusion has no setting 'guidance.margn'": the owner is the outermost settings object
                 root, _, path = f"{where}.{name}".partition(".")
                 owner = root or type(self).__name__
                 hint = suggestion(name, hints)
@@ -313,8 +315,8 @@ def _split(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 def _members(hint: Any) -> Iterator[tuple[Any, tuple[Any, ...]]]:
-    """The types of which a value may be, each with its Annotated metadata: the members of a union, or the
-    type itself."""
+    """The types that a value may have, each with its Annotated metadata: the members of a union, or the type
+    itself."""
     bare, marks = _split(hint)
     if get_origin(bare) not in UNIONS:
         yield bare, marks
@@ -334,8 +336,9 @@ def _fits(hint: Any, value: Any) -> bool:
 def converted(where: str, hint: Any, value: Any, owner: object = None) -> Any:
     """The value as its field stores it: a list as a tuple, a number of NumPy as Python's int or float.
 
-    owner: the settings object, for marks that compare the field with another field; None before it exists.
-    Raises InputError for a value of the wrong type, out of bounds, or refused by another mark of the field.
+    owner: the settings object that has the field; None if this object does not exist yet. A SettingsOf mark
+    is then not checked, since it reads another field of the object. Raises InputError for a value of the
+    wrong type, out of bounds, or refused by another mark of the field.
     """
     if not _fits(hint, value):
         raise InputError(f"{where} is {shown(value)}; it takes {_rule(hint)}")
@@ -353,6 +356,8 @@ def converted(where: str, hint: Any, value: Any, owner: object = None) -> Any:
         named = {str(key): entry for key, entry in value.items()}
         value = {key: converted(f"{where}.{key}", kinds[1], entry, owner) for key, entry in named.items()}
     elif bare in (int, float):
+        if isinstance(value, int) and abs(value) > sys.float_info.max:
+            raise InputError(f"{where} is {shown(value)}; it must be within ±1e308")
         value = bare(value)
     for mark in marks:
         _check_mark(where, mark, value, owner)
@@ -416,9 +421,12 @@ def field_docstrings(kind: type) -> dict[str, str]:
     for cls in reversed(kind.__mro__):
         if not dataclasses.is_dataclass(cls):
             continue
-        [tree] = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
-        body = tree.body if isinstance(tree, ast.ClassDef) else []
-        for field, text in pairwise(body):
+        try:
+            source = inspect.getsource(cls)
+        except (OSError, TypeError):  # a class that was typed in, or made by a function
+            continue
+        [tree] = ast.parse(textwrap.dedent(source)).body
+        for field, text in pairwise(tree.body if isinstance(tree, ast.ClassDef) else []):
             if (
                 isinstance(field, ast.AnnAssign)
                 and isinstance(field.target, ast.Name)

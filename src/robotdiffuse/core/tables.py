@@ -16,7 +16,7 @@ NO_VALUE = "–"
 WIDTH = 150
 """Width of tables without a terminal [characters]."""
 MIN_TEXT_WIDTH = 20
-"""Minimum width of the texts of pairs in narrow terminals [characters]."""
+"""Minimum width of the texts of `Table.pairs` in narrow terminals [characters]."""
 
 
 @dataclass(frozen=True)
@@ -87,8 +87,8 @@ class Table:
 
     @property
     def best(self) -> set[tuple[int, int]]:
-        """Row and column of each best figure. Figures with the same text are equally good. A column has no
-        best figure if more than half of the rows have it."""
+        """Row and column of each best figure. Figures with the same text are equally good. If more than half
+        of the rows have the best figure of a column, it is not marked."""
         places: set[tuple[int, int]] = set()
         for j, column in enumerate(self.columns):
             values = {i: _value(row[j]) for i, row in enumerate(self.rows)}
@@ -118,6 +118,7 @@ def _text(cell: Cell, column: Column) -> str:
         return NO_VALUE
     plain = isinstance(cell, int) and column.scale == 1 and not column.format
     text = f"{cell:,}" if plain else format(column.scale * cell, column.format or "g")
+    # a number that is shown as zero has no minus sign
     return text.replace("-", "−") if text.strip("-0.") else text.removeprefix("-")
 
 
@@ -138,10 +139,9 @@ def terminal(table: Table) -> "RichTable":
     )
     for j, column in enumerate(table.columns):
         rich_table.add_column(escape(column.title), justify="left" if table.at_left(j) else "right")
+    best = table.best
     for i, texts in enumerate(table.texts):
-        marked = (
-            f"[bold]{escape(t)}[/bold]" if (i, j) in table.best else escape(t) for j, t in enumerate(texts)
-        )
+        marked = (f"[bold]{escape(t)}[/bold]" if (i, j) in best else escape(t) for j, t in enumerate(texts))
         rich_table.add_row(*marked)
     return rich_table
 
@@ -198,7 +198,7 @@ def markdown(table: Table) -> list[str]:
     rule = "|".join(
         "-" * (width + 2) if table.at_left(j) else "-" * (width + 1) + ":" for j, width in enumerate(widths)
     )
-    notes = [line for note in table.notes for line in ("", plain(note))]
+    notes = [text for note in table.notes for text in ("", plain(note))]
     return [line(headings), f"|{rule}|", *(line(row) for row in texts), *notes]
 
 

@@ -20,6 +20,7 @@ from robotdiffuse.core.errors import (
     MAX_DURATION,
     MAX_RATE,
     InputError,
+    check_name,
     check_type,
     counted,
     distinct,
@@ -31,8 +32,7 @@ from robotdiffuse.core.errors import (
     rows,
     shown,
 )
-from robotdiffuse.core.input_files import known_ending, read_json
-from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.core.files import check_output, known_ending, read_json, write_atomically
 from robotdiffuse.core.settings import Bound, Natural, Number, converted
 
 Configuration = Float[ndarray, "dof"]
@@ -106,13 +106,14 @@ class Status(Enum):
 
     SOLVED = "solved"
     TIMEOUT = "timeout"
-    """No path was found within the time limit."""
+    """No path was found, or none could be timed, within the time limit."""
     NO_PATH = "no_path"
-    """The search ended before the time limit without a path."""
+    """The search ended before the time limit without a path or a valid motion."""
     INVALID_START = "invalid_start"
-    """The start is in collision or nearly so, or breaks a constraint."""
+    """The start is in collision or nearly so, breaks a constraint, or cannot hold the payload; or the arm
+    cannot stop from its start velocity."""
     INVALID_GOAL = "invalid_goal"
-    """Every goal is in collision or nearly so, or breaks a constraint."""
+    """Every goal is in collision or nearly so, breaks a constraint, or cannot hold the payload."""
     UNREACHABLE_GOAL = "unreachable_goal"
     """Inverse kinematics found no configuration for the goal pose."""
     ERROR = "error"
@@ -188,6 +189,8 @@ class Value:
 def read_only(value: T) -> T:
     """Returns the value unchanged if all its arrays are read-only, else a copy with read-only arrays. Arrays
     in tuples and dictionaries count too."""
+    if isinstance(value, np.ma.MaskedArray):  # what a mask hides is missing
+        return read_only(value.astype(np.float64).filled(np.nan))  # type: ignore[return-value]
     if isinstance(value, ndarray):
         if not _writable(value):
             return value
@@ -284,9 +287,21 @@ class Trajectory(Value):
     accelerations: Float[ndarray, "n dof"]
     """[rad/s²] or [m/s²]."""
 
+    def __post_init__(self) -> None:
+        """Converts lists and integers to arrays of floats. If there are any, or the shapes differ, it raises
+        InputError as `check_motion_arrays` does; else the names and numbers are left to the validator."""
+        names = self.joint_names
+        given = {name: getattr(self, name) for name in ("positions", "times", *RATES)}
+        q, t, v, a = (
+            value.shape if isinstance(value, ndarray) and value.dtype.kind == "f" else ()
+            for value in given.values()
+        )
+        if not (isinstance(names, tuple) and q == v == a == (*t, len(names)) and all(q)):
+            names, given = check_motion_arrays(names, given)
+            self.__dict__.update(given, joint_names=names)
+        super().__post_init__()
+
     def __repr__(self) -> str:
-        if not isinstance(self.times, ndarray) or self.times.ndim != 1 or not self.times.size:
-            return one_line(self)
         return (
             f"Trajectory({counted(len(self.joint_names), 'joint')}, "
             f"{counted(len(self.times), 'row')}, {self.duration:.3g} s)"
@@ -322,8 +337,8 @@ class Trajectory(Value):
         """Interpolate the motion at one time or at several times.
 
         Positions and velocities are those of the cubics between rows. Accelerations are linear between rows,
-        and jerks are their slopes; at a row, the jerk is that of the step after the row. A trajectory of one
-        row has zero jerk.
+        and jerks are their slopes; at a row, the jerk is that of the step after the row, at the last row that
+        of the step before it. A trajectory of one row has zero jerk.
 
         Args:
             time: Time, or times [n], from 0 to the duration [s].
@@ -332,7 +347,7 @@ class Trajectory(Value):
             Positions, velocities, accelerations and jerks, each [dof], or [n, dof] for several times.
 
         Raises:
-            InputError: For a time outside of the motion.
+            InputError: For a time that is no number or outside of the motion.
         """
         times = numbers(time)
         if times is None:
@@ -368,8 +383,9 @@ class Trajectory(Value):
     def resample(self, rate: float | int) -> "Trajectory":
         """Sample the motion at a constant rate, with a last row at its end.
 
-        With fewer rows, the cubics between the rows may need larger accelerations where the acceleration
-        changes quickly. A motion from rest to rest is then averaged: its rows lie on the uniform cubic
+        At a low rate, the cubics between the new rows may need larger accelerations than this motion has,
+        where its acceleration changes quickly. A motion from rest to rest is then averaged: its rows lie on
+        the uniform cubic
         B-spline that has the resampled positions as control points. An averaged motion leaves the path by up
         to a sixth of the acceleration divided by rate², and lasts up to three steps longer. Validate the
         returned motion: between its rows it may differ from this one.
@@ -406,18 +422,19 @@ class Trajectory(Value):
         `robotdiffuse.interop.write_motion` writes the formats of ROS 2, Foxglove and Rerun.
 
         Args:
-            file: A .json or .csv file. The header of .csv is time, then <joint>_position, <joint>_velocity
-                and <joint>_acceleration.
+            file: A .json or .csv file. The columns of .csv are time, then <joint>_position of all joints,
+                then <joint>_velocity of all joints, then <joint>_acceleration of all joints.
             rate: Rows in a second [Hz]; None: the rows of the motion.
 
         Raises:
-            InputError: For another ending, a file that cannot be written, or a rate that `resample` refuses.
+            InputError: For another ending, a file that cannot be written, a rate that `resample` refuses, and
+                for .json if numbers are not finite.
         """
         path = check_output(file, (".json", ".csv"))
         if rate is not None:
             return self.resample(rate).save(path)
         if path.suffix.lower() == ".json":
-            write_atomically(path, json.dumps(self.record(), allow_nan=False) + "\n")
+            _write_json(path, self.record())
         else:
             write_atomically(path, self._csv())
 
@@ -442,6 +459,14 @@ class Trajectory(Value):
         return stream.getvalue()
 
 
+def _write_json(file: FilePath, record: dict[str, Any]) -> None:
+    try:
+        text = json.dumps(record, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{file}: JSON holds texts, lists and finite numbers only: {error}") from None
+    write_atomically(file, text + "\n")
+
+
 Rows = tuple[Float[ndarray, "n"], Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]
 """Times, positions, velocities and accelerations."""
 
@@ -463,7 +488,8 @@ def spline_rows(
     """The rows of a uniform cubic B-spline that smooths a motion that ends at rest.
 
     Its control points are moving averages over `window` configurations in `controls`, which are `step` [s]
-    apart. Before the first configuration, the arm moved with the constant `velocity`.
+    apart. Before the first configuration, the arm moved with the constant `velocity`; the rows begin
+    (window + 1) / 2 steps before this configuration.
 
     Velocities and accelerations are weighted means of those of the motion, so they obey the same limits at
     every time; jerks are constant between rows. With a window of 1, the spline leaves the motion's path by at
@@ -579,8 +605,8 @@ class PlanResult:
     """Name of the robot."""
     planning_time: float
     """Wall time of plan() until the returned path is validated [s], without loading time. The path's final
-    time parameterization follows and does not count, except with waypoints, camera views or moving
-    obstacles."""
+    time parameterization follows and does not count, except with waypoints, camera views, moving obstacles
+    or a Cartesian line."""
     seed: int
     """Seed of the random numbers."""
     stage: str = ""
@@ -664,7 +690,8 @@ class PlanResult:
                 bundled nor read from a file, the file holds no problem, and a note says so.
 
         Raises:
-            InputError: For another ending, a file that cannot be written, or .csv without a trajectory.
+            InputError: For another ending, a file that cannot be written, .csv without a trajectory, and a
+                problem that is no table or has values that JSON cannot hold, such as arrays.
         """
         path = check_output(file, (".json", ".csv"))
         if path.suffix.lower() == ".json":
@@ -675,7 +702,7 @@ class PlanResult:
                 except InputError as error:
                     notes = (*notes, f"{NO_PROBLEM}: {error}")
             record = replace(self, notes=notes).record(problem)
-            write_atomically(path, json.dumps(record, allow_nan=False) + "\n")
+            _write_json(path, record)
         elif self.trajectory is None:
             raise InputError(f"{path}: there is no trajectory to write ({self.status.value}); use .json")
         else:
@@ -689,7 +716,11 @@ class PlanResult:
 
         Returns:
             The content of a result file.
+
+        Raises:
+            InputError: If `problem` is no table.
         """
+        check_type("problem", problem, (dict, NoneType), "the content of a problem file, a table")
         path = self.path
         record: dict[str, Any] = {"status": self.status.value}
         record |= {name: getattr(self, name) for name in RECORDED}
@@ -727,8 +758,10 @@ def load_result(file: str | FilePath) -> ResultFile:
         The result, and the content of its problem file if that was saved too.
 
     Raises:
-        InputError: For a file that cannot be read, and for fields that are missing, of the wrong shape or not
-            finite.
+        InputError: For another ending, a problem file, a file that cannot be read, and fields that are
+            missing, of the wrong type or shape, out of bounds or not finite; for an unknown status, for
+            repeated joint names, for times that do not begin at 0 or do not increase, and if `verified`
+            contradicts the status.
 
     Examples:
         >>> problem = rd.Problem(rd.load_robot("panda"), rd.Scene(), "ready", "extended")
@@ -781,8 +814,7 @@ lacks is null."""
 
 def _result(record: dict[str, Any]) -> PlanResult:
     statuses = {status.value: status for status in Status}
-    if not isinstance(record["status"], str) or record["status"] not in statuses:
-        raise InputError(f"status is {shown(record['status'])}; known: {', '.join(statuses)}")
+    check_name("status", record["status"], statuses)
     status = statuses[record["status"]]
     solved = status is Status.SOLVED
     if record["verified"] is not solved:

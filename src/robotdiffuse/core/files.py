@@ -1,22 +1,26 @@
-"""Readers of untrusted files: JSON, YAML, XML and NumPy arrays, with bounds on size and nesting.
+"""Readers of untrusted files (JSON, YAML, XML and NumPy arrays, with bounds on size and nesting), atomic and
+line-by-line writing, and locks on output folders.
 
-For any content and any file name these functions return a value or raise InputError, in time that grows with
-the size of the file: devices and pipes are not opened, nesting deeper than MAX_DEPTH is refused, and the
-values that YAML aliases stand for are counted.
+For any content and any file name the readers return a value or raise InputError. Their time is bounded by the
+size of the file: devices and pipes are not opened, nesting deeper than MAX_DEPTH is refused, and the values
+that YAML aliases stand for are counted.
 """
 
 import errno
+import fcntl
 import json
 import os
 import re
+import secrets
 import stat
 import xml.etree.ElementTree as ET
 import zipfile
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, NoReturn
+from tempfile import TemporaryDirectory, TemporaryFile
+from typing import Any, BinaryIO, NoReturn
 
 import numpy as np
 import yaml
@@ -25,6 +29,7 @@ from numpy import ndarray
 from robotdiffuse.core.errors import (
     MAX_WORD,
     InputError,
+    OutputError,
     check_name,
     check_type,
     reading,
@@ -44,14 +49,16 @@ MAX_VALUES = 2_000_000
 MAX_DIGITS = 30
 """Largest number of digits of an integer."""
 
+JsonObject = dict[str, Any]
+"""A JSON object as it is read: values by name."""
 _STRING = re.compile(r'"(?:[^"\\]|\\.)*"?')
 _closed: ContextVar[bool] = ContextVar("closed", default=False)
 
 
 @contextmanager
 def no_files() -> Iterator[None]:
-    """Within the block, `is_file` returns False and `input_file` raises InputError: for requests from the
-    network, which must not read files."""
+    """Within the block, `is_file` returns False and `input_file` raises InputError. For HTTP requests,
+    which must not read files."""
     before = _closed.set(True)
     try:
         yield
@@ -61,7 +68,7 @@ def no_files() -> Iterator[None]:
 
 def file_name(file: object, what: str = "file") -> Path:
     """The name as a path. Raises InputError, naming `what`, for a value that is neither text nor a path, and
-    for a name that is too long."""
+    for a name that is too long or that no file can have."""
     if not isinstance(file, str | os.PathLike):
         raise InputError(f"{what} is {shown(file)}; it must be a file name: a text or a pathlib.Path")
     path = Path(file)
@@ -70,8 +77,8 @@ def file_name(file: object, what: str = "file") -> Path:
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:  # pathlib would raise this OSError later, at the first access
             raise InputError(f"{what} {path}: {error.strerror}") from None
-    except ValueError:  # a NUL in the name; `input_file` raises InputError for it
-        pass
+    except ValueError:  # a NUL or half a surrogate pair in the name
+        raise InputError(f"{what} {shortened(path, MAX_WORD)} is not a valid file name") from None
     return path
 
 
@@ -150,7 +157,7 @@ def read_arrays(file: str | Path) -> dict[str, ndarray]:
     path = input_file(file)
     with reading(file):
         if path.suffix.lower() != ".npz":
-            with path.open("rb") as stream:  # np.load would also open an archive with this ending
+            with path.open("rb") as stream:  # np.load would open a zip archive with any ending
                 return {"": np.lib.format.read_array(stream, allow_pickle=False)}
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
@@ -276,7 +283,12 @@ class _Composer:
             loader.get_event()
             value = self._node(0)
             loader.get_event()
-            if not loader.check_event(yaml.StreamEndEvent):
+            further = None
+            if loader.check_event(yaml.DocumentStartEvent):  # `ros2 topic echo` ends messages with ---
+                loader.get_event()
+                further = self._node(0)
+                loader.get_event()
+            if further is not None or not loader.check_event(yaml.StreamEndEvent):
                 raise InputError(f"{self.where} is not valid YAML: it holds more than one document")
         return value
 
@@ -292,7 +304,7 @@ class _Composer:
             value = self._value(event, depth)
             self.count += 1
         if self.count > MAX_VALUES:
-            self._refuse(event, f"it stands for more than {MAX_VALUES:,} values")
+            self._refuse(event, f"with aliases expanded, it stands for more than {MAX_VALUES:,} values")
         if event.anchor is not None:
             self.anchors[event.anchor] = value, self.count - begun
         return value
@@ -309,7 +321,7 @@ class _Composer:
                 values.append(self._node(depth + 1))
             loader.get_event()
             return values
-        mapping: dict[str, Any] = {}
+        mapping: JsonObject = {}
         while not loader.check_event(yaml.MappingEndEvent):
             key = self._event()
             if not isinstance(key, yaml.ScalarEvent):
@@ -351,7 +363,7 @@ def _reason(error: yaml.YAMLError) -> str:
     return shortened(error, MAX_WORD)
 
 
-def _object(pairs: list[tuple[str, Any]], where: str) -> dict[str, Any]:
+def _object(pairs: list[tuple[str, Any]], where: str) -> JsonObject:
     mapping = dict(pairs)
     if len(mapping) < len(pairs):
         twice = repeated(name for name, _ in pairs)[0]
@@ -371,3 +383,201 @@ def _check_digits(text: str, where: str) -> None:
 
 def _too_deep(where: str) -> NoReturn:
     raise InputError(f"{where} is nested more than {MAX_DEPTH} levels deep")
+
+
+# Errors of the disk (full, over a quota, file too large, input/output error): another file name would not
+# help.
+DISK_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+
+
+@contextmanager
+def writing(file: Path) -> Iterator[None]:
+    """Within the block, an OSError becomes the error for a file or folder that could not be written:
+    OutputError for an error of the disk, such as a full one, otherwise InputError."""
+    try:
+        yield
+    except OSError as error:
+        kind = OutputError if error.errno in DISK_FAILURES else InputError
+        raise kind(f"{file} cannot be written: {error.strerror or error}") from None
+
+
+def write_atomically(
+    file: Path, content: str | bytes | Callable[[BinaryIO], object], make_folder: bool = False
+) -> None:
+    """Write a temporary file and rename it to `file`, or to the file that the link `file` names, so that no
+    reader sees `file` half written.
+
+    content: text, bytes, or a function that writes to the stream that it is given.
+    make_folder: whether to make the folder of `file` if it does not exist.
+
+    If writing fails or is interrupted, an existing `file` keeps its content. Raises InputError if the file
+    cannot be written, and its subclass OutputError for an error of the disk, such as a full one.
+    """
+    with writing(file):
+        target = Path(os.path.realpath(file))  # a link stays, and the file that it names is replaced
+        temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
+        if make_folder:
+            target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with temporary.open("wb") as stream:
+                if callable(content):
+                    content(stream)
+                else:
+                    stream.write(content.encode("utf-8", "replace") if isinstance(content, str) else content)
+            temporary.replace(target)
+        except BaseException:
+            with suppress(OSError):
+                temporary.unlink()
+            raise
+
+
+@contextmanager
+def replaced_folder(target: Path) -> Iterator[Path]:
+    """Yields a path at which the block makes a folder. At the end of the block, the folder replaces `target`.
+    If the block or the replacement fails, an existing `target` stays.
+
+    Raises InputError as `write_atomically` does.
+    """
+    with writing(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(
+            prefix=f".{target.name}.", dir=target.parent, ignore_cleanup_errors=True
+        ) as scratch:
+            new = Path(scratch, target.name)
+            old = Path(scratch, f"{target.name}.old")
+            yield new
+            try:
+                with suppress(FileNotFoundError):
+                    target.replace(old)
+                new.replace(target)
+            except BaseException:
+                with suppress(OSError):
+                    old.replace(target)
+                raise
+
+
+def check_not_input(out: Path, *inputs: str | None) -> None:
+    """Raise InputError if the file or folder `out` is one of the inputs."""
+    with writing(out):  # `realpath` raises OSError if the current folder was deleted
+        if os.path.realpath(out) in map(os.path.realpath, filter(None, inputs)):
+            raise InputError(f"{out} is an input of this command; name another output")
+
+
+def check_output(file: str | Path, endings: tuple[str, ...], *inputs: str | None) -> Path:
+    """The file as a path, after checking that it can be written.
+
+    Raises InputError for an ending that is not in `endings`, for the name of a folder, if the file or its
+    folder is read-only, if its folder is missing, and if it would replace one of the files `inputs`. Raises
+    the subclass OutputError for a full disk.
+    """
+    path = file_name(file)
+    check_not_input(path, *inputs)
+    if path.suffix.lower() not in endings:
+        raise InputError(f"{path}: unknown ending {shown(path.suffix)}; known: {', '.join(endings)}")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; name a file")
+    if not path.parent.is_dir():
+        why = "is a file, not a folder" if path.parent.exists() else "does not exist"
+        raise InputError(f"{path}: the folder {path.parent} {why}")
+    with writing(path):
+        TemporaryFile(dir=path.parent).close()
+        if path.exists() and not os.access(path, os.W_OK):
+            raise PermissionError("permission denied")
+    return path
+
+
+def append_line(file: Path, line: str, make_folder: bool = False) -> None:
+    """Append a line to `file` and flush it to the disk. `make_folder` as for `write_atomically`.
+
+    If writing fails, an existing `file` keeps its content. Raises InputError as `write_atomically` does.
+    """
+    with writing(file):
+        if make_folder:
+            file.parent.mkdir(parents=True, exist_ok=True)
+        with file.open("a+b", buffering=0) as stream:
+            size = stream.seek(0, os.SEEK_END)
+            stream.seek(max(size - 1, 0))
+            begin = "" if stream.read(1) in (b"", b"\n") else "\n"  # the last line may lack its end
+            unwritten = memoryview(f"{begin}{line}\n".encode())
+            try:
+                while unwritten:
+                    unwritten = unwritten[stream.write(unwritten) :]
+                os.fsync(stream.fileno())
+            except BaseException:
+                stream.truncate(size)
+                raise
+
+
+class JsonLines:
+    """A file of JSON objects, one per line. `append` returns once the row is on disk. If `file` is None, rows
+    are kept in memory only."""
+
+    def __init__(self, file: Path | None) -> None:
+        """Read the existing rows. A last line without a line break, as a killed process leaves, is ignored.
+
+        Raises InputError, naming file and line, for a complete line that is not a JSON object.
+        """
+        self.rows: list[JsonObject] = []
+        self._file = file
+        self._without_cut_line: bytes | None = None
+        if file is None or not file.is_file():
+            return
+        content = file.read_bytes()
+        complete_lines = content[: content.rfind(b"\n") + 1]
+        for number, line in enumerate(complete_lines.splitlines(), start=1):
+            try:
+                self.rows.append(dict(json.loads(line)))
+            except (ValueError, TypeError) as error:
+                raise InputError(f"{file}, line {number} is not a JSON object: {error}") from None
+        if complete_lines != content:
+            self._without_cut_line = complete_lines
+
+    def replace(self, rows: list[JsonObject]) -> None:
+        """Replace all rows, atomically."""
+        self.rows = rows
+        if self._file is not None:
+            write_atomically(self._file, "".join(json.dumps(row) + "\n" for row in rows), make_folder=True)
+
+    def append(self, row: JsonObject) -> None:
+        """Add a row and flush it to the disk. If writing fails, the row is in neither the file nor `rows`."""
+        if self._file is not None:
+            if self._without_cut_line is not None:
+                # The incomplete line is removed only now: at reading, another process could still be writing
+                # it.
+                write_atomically(self._file, self._without_cut_line)
+                self._without_cut_line = None
+            append_line(self._file, json.dumps(row), make_folder=True)
+        self.rows.append(row)
+
+
+@contextmanager
+def lock_folder(out: Path) -> Iterator[None]:
+    """Make the folder, and lock it during the block. The lock is also released if the process is killed.
+    Temporary files that a killed process left (see `write_atomically`) are removed. At the end of the block,
+    folders that were made here and are still empty are removed.
+
+    Raises InputError if another process holds the lock or the folder cannot be made or written into.
+    """
+    with writing(out):
+        new_folders = [folder for folder in (out, *out.parents) if not folder.exists()]
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except FileExistsError:
+            raise InputError(f"cannot use the folder {out}: it is a file, or a link to nothing") from None
+        TemporaryFile(dir=out).close()
+        folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"another process is filling {out}; wait for it") from None
+        except OSError:
+            pass  # this file system has no locks
+        for leftover in out.glob(f".*.{'[0-9a-f]' * 16}.tmp"):
+            leftover.unlink(missing_ok=True)
+        yield
+    finally:
+        os.close(folder)
+        with suppress(OSError):  # one is not empty
+            for empty in new_folders:
+                empty.rmdir()
