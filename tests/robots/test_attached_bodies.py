@@ -106,8 +106,7 @@ def test_a_tool_is_the_tip_and_its_shapes_are_in_the_frame_of_its_link() -> None
     q = np.array([0.1, 0.2, 0.3, -1.5, 0.2, 1.5, 0.3])
     assert robot.tip == "tool"
     assert np.allclose(robot.fk(q, "tool"), PANDA.fk(q, "panda_hand") @ T_hand_tool)
-    on_axis = np.array([0.0, 0.0, 0.05, 1.0]), np.array([0.0, 0.0, 0.15, 1.0])
-    for point in on_axis:
+    for point in (np.array([0.0, 0.0, 0.05, 1.0]), np.array([0.0, 0.0, 0.15, 1.0])):
         local = np.linalg.inv(T_hand_tool) @ point
         assert inside(robot.meshes["tool"][0], local[None, :3], 1e-9).all()
     assert "tool" not in PANDA.with_tool("panda_hand", T_hand_tool).spheres, "a mere frame"

@@ -98,6 +98,7 @@ def test_inverse_kinematics_of_a_robot_nearest_first() -> None:
     assert len(found) == 5 and np.abs(panda.fk(found) - panda.fk(q)).max() < 1e-5
     np.testing.assert_allclose(found[0], q, atol=1e-4)
     refuses("seed is -1; it must be at least 0", panda.ik, np.eye(4), seed=-1)
+    refuses("near is .*; it must be 7 finite numbers", panda.ik, np.eye(4), near=[q, q])
     assert panda.ik(transform(np.array([9.0, 0.0, 0.0]))).shape == (0, 7)
     refuses(r"q is .* it must be 7 numbers, or rows of them: panda_joint1", panda.fk, [0.0, 1.0])
     refuses("unknown link 'moon'", panda.jacobian, q, "moon")
@@ -116,8 +117,7 @@ def sampled_radii(robot: rd.Robot, count: int) -> np.ndarray:
         points = np.einsum("nik,sk->nsi", T_base_link[:, :3, :3], spheres[:, :3]) + T_base_link[:, None, :3, 3]
         for j in robot.chain(link):
             axis = frames[:, j + 1, :3, 2]
-            origin = frames[:, j + 1, :3, 3]
-            lever = np.linalg.norm(np.cross(axis[:, None], points - origin[:, None]), axis=-1)
+            lever = np.linalg.norm(np.cross(axis[:, None], points - frames[:, j + 1, None, :3, 3]), axis=-1)
             out[i, j] = 1.0 if robot.prismatic[j] else (lever + spheres[:, 3]).max()
     return out
 
@@ -230,3 +230,10 @@ def test_bad_input() -> None:
         ("panda_hand", 2 * np.eye(4), 1, "must be a homogeneous transform"),
     ):
         refuses(message, inverse_kinematics, example_robot("panda"), frame, T, count, rng=np.random.default_rng(0))
+
+
+def test_solutions_near_a_place_beyond_the_limits_keep_the_limits_and_a_huge_count_means_all() -> None:
+    robot = rd.load_robot("ur5")
+    q = np.array([0.3, -1, 1, 0.2, 0.5, 0.1])
+    solutions = robot.ik(robot.fk(q), near=[20, *q[1:]], count=10**20)
+    assert 1 <= len(solutions) <= 8 * 2**5 and (robot.limit_excess(solutions) <= 0).all()

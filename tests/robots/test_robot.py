@@ -155,3 +155,9 @@ def test_what_is_compiled_is_not_pickled() -> None:
     again = pickle.loads(pickle.dumps(robot))
     assert again.locked == robot.locked and again.link_names == robot.link_names
     np.testing.assert_array_equal(compile_robot(again).spheres, compile_robot(robot).spheres)
+
+
+def test_a_bundled_name_does_not_depend_on_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_robot_folder(replace(box_arm(), name="other"), tmp_path / "panda", {})
+    monkeypatch.chdir(tmp_path)
+    assert load_robot("panda").name == "panda" and load_robot("./panda").name == load_robot(Path("panda")).name == "other"

@@ -34,8 +34,7 @@ def two_arms() -> Robot:
     spheres = {link: np.concatenate([cover(part) for part in parts]) for link, parts in robot.meshes.items()}
     beside = [("pedestal", "torso")]
     for side in ("left", "right"):
-        limb = ("torso", *(f"{side}_{part}" for part in ("upper", "lower", "hand")))
-        beside += pairwise(limb)
+        beside += pairwise(("torso", *(f"{side}_{part}" for part in ("upper", "lower", "hand"))))
     return replace(robot, spheres=spheres, allowed_collisions=frozenset(map(frozenset, beside)))
 
 

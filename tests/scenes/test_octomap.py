@@ -93,7 +93,7 @@ def test_a_height_map_is_an_obstacle_with_holes(tmp_path: Path) -> None:
 
 def test_wrong_height_maps() -> None:
     refuses(r"height_map\.heights is an array of 2; it must be rows x columns", rd.HeightMap, [0.0, 1.0], 0.1)
-    refuses("not within", rd.HeightMap, [[0.0, 1e9], [0, 0]], 0.1)
+    refuses("size 1e.09; all must be within", rd.HeightMap, [[0.0, 1e9], [0, 0]], 0.1)
     refuses("no cell with heights at all four corners", rd.HeightMap, [[np.nan, 1], [0, 0]], 0.1)
     refuses("'height_map' is a height_map; it must be one of sphere", rd.HeightMap(np.zeros((2, 2)), 0.1).solid)
 

@@ -75,8 +75,7 @@ def test_other_links_may_not_touch_it() -> None:
     folded = JointPath(box_arm().joint_names, np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]]))
     free = rd.Problem(box_arm(), rd.Scene([BALL], contacts), folded.positions[0], folded.positions[1])
     assert rd.verify(free, folded).valid
-    near = replace(BALL, center=[0.8, 0.2, 0.0])  # beside the middle link
-    scene = rd.Scene([near], contacts)
+    scene = rd.Scene([replace(BALL, center=[0.8, 0.2, 0.0])], contacts)  # the ball is beside the middle link
     report = rd.verify(replace(free, scene=scene), folded)
     assert report.violation is not None and report.violation.message.startswith("l2")
     checker = CollisionChecker(box_arm(), scene)
@@ -84,14 +83,11 @@ def test_other_links_may_not_touch_it() -> None:
     assert dict(zip(checker.links, checker.link_clearances(folded.positions)[1], strict=True))["l3"] == 1.0
 
 
-def test_costs_pass_over_allowed_contacts() -> None:
+def test_costs_pass_over_allowed_contacts_of_the_links_that_have_them_alone() -> None:
     q = np.zeros((1, 3))
     cost, gradient = CollisionChecker(box_arm(), rd.Scene([BALL], {"ball": "all"})).cost_gradients(q, 0.05)
     assert cost[0] == 0 and not gradient.any()
     assert CollisionChecker(box_arm(), rd.Scene([BALL])).cost_gradients(q, 0.05)[0][0] > 0
-
-
-def test_a_large_mesh_that_may_be_touched_is_still_seen_by_other_links() -> None:
     made = trimesh.creation.icosphere(subdivisions=6, radius=0.1)  # 81,920 triangles
     mesh = rd.Mesh(made.vertices, made.faces, BALL.center, name="ball")
     for links, free in ((["l3"], True), (["l1", "l2"], False)):
@@ -148,10 +144,7 @@ for thing in things:
 def test_wrong_names_and_motions_are_refused_in_one_line() -> None:
     """Regression: lists in place of names were a TypeError or a ValueError; a box moved by twice the identity stayed."""
     python(WRONG_TYPES)  # without this suite's type checks
-
-
-def test_what_a_scene_cannot_hold_is_not_lost() -> None:
-    """Regression: a held object that is no shape of a scene was in neither scene nor robot after `Scene.detach`."""
+    # a held object that is no shape of a scene was in neither scene nor robot after `Scene.detach`
     held = box_arm().attach(SolidOnly(), "l3")
     refuses(r"scene\[1\] is .*SolidOnly.*; it must be a shape", rd.Scene([WALL]).detach, "lump", held, np.zeros(3))
 

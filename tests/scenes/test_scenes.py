@@ -302,3 +302,10 @@ def test_meshes_and_clouds_from_files_with_a_scale(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="not finite"):
         assert rd.PointCloud.from_file(tmp_path / "cloud.npy", scale=0.001).point_radius == 0.01, "it was 10 µm"
     refuses(r"mesh\.scale is 0; it must be a number from", rd.Mesh.from_file, tmp_path / "cube.stl", scale=0)
+
+
+@pytest.mark.parametrize("first", ["# shelf, scanned in May\n", "#\n", "# a, b\n# x,y,z\n", "\nx y z\n"])
+@pytest.mark.parametrize("row", ["1 2 3\n", "1,2,3\n"])
+def test_the_first_line_of_a_cloud_does_not_tell_the_separator(first: str, row: str, tmp_path: Path) -> None:
+    (tmp_path / "points.xyz").write_text(first + row)
+    assert read_points(tmp_path / "points.xyz")[0].tolist() == [[1, 2, 3]]

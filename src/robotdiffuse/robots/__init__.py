@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from robotdiffuse.core.errors import InputError, check_name, check_type
-from robotdiffuse.core.input_files import is_file
+from robotdiffuse.core.files import is_file
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import Robot, robot_fingerprint
@@ -42,7 +42,7 @@ def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robo
         locked: Values at which joints are locked [rad] or [m] (see `Robot.with_locked`).
 
     Returns:
-        The robot, with all other movable joints between its base and its tips planned.
+        The robot. All movable joints between its base and its tips are planned, except the locked ones.
 
     Raises:
         InputError: For an unknown name or bad input.
@@ -52,8 +52,9 @@ def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robo
         7
     """
     check_type("robot", name, (str, PathLike), "its name, or the path of its folder, URDF or MuJoCo model")
+    name = name if isinstance(name, str) else Path(name)
     text = str(name)
-    if is_file(Path(name) / ROBOT_FILE):
+    if names_a_file(name) and is_file(Path(name) / ROBOT_FILE):
         robot = _read(Path(name), str(Path(name).resolve()))
     elif names_a_file(name):
         robot = _from_urdf(Path(name))
@@ -67,7 +68,8 @@ def names_a_file(name: str | Path) -> bool:
     name."""
     text = str(name)
     by_form = text.endswith(FILE_ENDINGS) or "/" in text or "\\" in text
-    return by_form or isinstance(name, Path) or is_file(Path(name) / ROBOT_FILE)
+    folder = text not in ROBOTS and is_file(Path(name) / ROBOT_FILE)
+    return by_form or isinstance(name, Path) or folder
 
 
 def _by_name(name: str) -> Robot:
@@ -134,7 +136,11 @@ def _from_urdf(urdf: Path) -> Robot:
                 outdated.append(name)
         except InputError:
             continue  # another robot's damaged folder must not prevent loading this one
-    if len({(robot_fingerprint(robot), json.dumps(robot.poses)) for robot in robots.values()}) > 1:
+    differences = {
+        (robot_fingerprint(robot), json.dumps([robot.poses, [joint.effort for joint in robot.joints]]))
+        for robot in robots.values()
+    }
+    if len(differences) > 1:
         raise InputError(
             f"{urdf} was added as {', '.join(robots)}, which differ in joints, limits, spheres, allowed "
             f"pairs or poses; use one of these names instead, or delete the other robots in {user_robots()}"
@@ -143,8 +149,8 @@ def _from_urdf(urdf: Path) -> Robot:
         return next(iter(robots.values()))
     if outdated:
         raise InputError(
-            f"{urdf}: its SRDF has changed since robot {outdated[0]} was made; make it again, with the same "
-            f"options: robotdiffuse robot add {urdf} --name {outdated[0]}; or load it by its name"
+            f"the SRDF of {urdf} has changed since robot {outdated[0]} was made. Load it by this name, or "
+            f"make it again: robotdiffuse robot add {urdf} --name {outdated[0]}, with the options used then"
         )
     report = add_robot(urdf, out=user_robots() / f"{tree.name}-{digest[:8]}")
     note = f"{report.sphere_count} spheres were fitted to {urdf.name} and stored in {report.folder}"

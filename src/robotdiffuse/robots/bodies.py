@@ -112,20 +112,18 @@ class Inertia(NamedTuple):
     @property
     def values(self) -> list[float]:
         """Mass, center of mass and moments as the ten numbers that `inertia_of` takes."""
-        upper = self.moments[np.triu_indices(3)]
-        return [self.mass, *self.com.tolist(), *upper.tolist()]
+        return [self.mass, *self.com.tolist(), *self.moments[np.triu_indices(3)].tolist()]
 
 
 def inertia_of(values: ArrayLike) -> Inertia:
     """An inertia from the ten numbers mass, x, y, z, ixx, ixy, ixz, iyy, iyz, izz. Raises ValueError for
-    anything else, and for physically impossible numbers."""
+    anything else, for a mass that is not positive, and for negative principal moments of inertia."""
     row = np.array(values, np.float64)
     if row.shape != (10,) or not within(row):
         raise ValueError("ten finite numbers expected")
     xx, xy, xz, yy, yz, zz = row[4:]
     moments = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    min_moment = float(np.linalg.eigvalsh(moments)[0])
-    if not row[0] > 0 or min_moment < -SLACK * np.abs(moments).max():
+    if not row[0] > 0 or float(np.linalg.eigvalsh(moments)[0]) < -SLACK * np.abs(moments).max():
         raise ValueError("a mass above 0 and moments of inertia of at least 0 expected")
     return read_only(Inertia(float(row[0]), row[1:4], moments))
 

@@ -31,7 +31,8 @@ class Stretches(NamedTuple):
     q: Configurations
     """Largest absolute values of the joint positions [rad] or [m]."""
     v: Float[ndarray, "3 n dof"]
-    """Largest absolute values of the first three derivatives of the joint positions."""
+    """Largest absolute values of the first three derivatives of the joint positions, by the fraction of the
+    stretch."""
     speed: Float[ndarray, "3 n dof"]
     """Largest absolute values of the joint velocities and of the velocities' first two derivatives. For a
     path without times they are zero."""
@@ -102,8 +103,8 @@ class Dynamics:
             frame = robot.link_frame(name)
             body = pinocchio.Inertia(inertia.mass, inertia.com, inertia.moments)
             model.appendBodyToJoint(frame, body, pinocchio.SE3(T[:3, :3], T[:3, 3]))
-        up = np.array([0.0, 0.0, 1.0]) if T_world_base is None else T_world_base[2, :3]
-        model.gravity.linear = -GRAVITY * up
+        T_world_base = np.eye(4) if T_world_base is None else T_world_base
+        model.gravity.linear = -GRAVITY * T_world_base[2, :3]
         self._model, self._data = model, model.createData()
         self._bodies = [
             Body(
@@ -170,6 +171,7 @@ class Dynamics:
             body, (rotation, omega, alpha, linear) = bodies[j], frames[j]
             lever = _fixed(body.lever, rotation)
             body_force = body.mass * (linear + product(alpha, lever) + product(omega, product(omega, lever)))
+            # bounds on R I R^T and its first two derivatives; R occurs twice, hence the factors 2 and 4
             inertia = body.inertia * np.stack(
                 [np.ones_like(rotation[0]), 2 * rotation[0], 2 * rotation[1] + 4 * rotation[0] ** 2]
             )
@@ -204,14 +206,15 @@ class Dynamics:
 
 
 def check_dynamics(robot: Robot) -> None:
-    """Raise InputError if a planned joint of the robot has no effort limit, or if links with geometry move
-    with it but none with an inertia. Frames without geometry, as in a mobile base, need no inertia."""
+    """Raise InputError if a planned joint of the robot has no effort limit, or if links with geometry are
+    fixed to its frame, but none with an inertia. Frames without geometry, as in a mobile base, need no
+    inertia."""
     solid, heavy = ({robot.link_frame(link) for link in links} for links in (robot.meshes, robot.inertias))
     for j, name in enumerate(robot.joint_names):
         weightless = j + 1 in solid - heavy
-        missing = "inertia of what moves with" if weightless else "effort limit of"
+        missing = "link with an inertia" if weightless else "effort limit"
         if weightless or not robot.effort[j] > 0:
             raise InputError(
-                f"payload: {robot.name} has no {missing} joint {name}; its URDF must give inertias and "
+                f"payload: joint {name} of {robot.name} has no {missing}; its URDF must give inertias and "
                 f"effort limits; then create the robot again with: robotdiffuse robot add"
             )

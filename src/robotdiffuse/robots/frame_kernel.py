@@ -4,7 +4,7 @@ import numpy as np
 
 from robotdiffuse.core.kernels import allocation_free, inner_kernel
 
-inlined = allocation_free(fastmath={"contract"}, forceinline=True)  # type: ignore[arg-type]  (a set is fine)
+inlined = allocation_free(fastmath={"contract"}, forceinline=True)
 
 
 @inlined

@@ -107,7 +107,8 @@ def inverse_kinematics(
         before = len(accepted)
         while len(seeds) and len(accepted) < count:
             accepted_arm = np.ascontiguousarray(accepted[:, arm])
-            new, used = solve_seeds(seeds, accepted_arm, count - len(accepted), chain, target, parameters)
+            missing = min(count - len(accepted), len(seeds))
+            new, used = solve_seeds(seeds, accepted_arm, missing, chain, target, parameters)
             seeds = seeds[used:]
             if len(arm) < robot.dof:
                 new_arm = new
@@ -194,6 +195,5 @@ def random_seeds(
 def on_other_arm(robot: KinematicTree, link: str) -> Bool[ndarray, "dof"]:
     """Mask of the planned joints of other arms: joints that neither move a link nor come after it."""
     frame = robot.link_frame(link)
-    before = robot.moved_by[frame]
     downstream = robot.moved_by[1:, frame - 1] if frame else np.ones(robot.dof, bool)
-    return ~(before | downstream)
+    return ~(robot.moved_by[frame] | downstream)

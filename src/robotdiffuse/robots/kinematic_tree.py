@@ -184,6 +184,7 @@ class KinematicTree(Value):
         for i, chain in enumerate(chains):
             for joint in chain:
                 first.setdefault(joint.name, i)
+        # chains that share their first joints follow each other
         chains.sort(key=lambda chain: [first[joint.name] for joint in chain])
         ordered = {joint.name: joint for chain in chains for joint in chain}.values()
         return tuple(j for j in ordered if j.kind in MOVING_KINDS and j.name not in self.locked)
@@ -252,8 +253,9 @@ class KinematicTree(Value):
         """Configurations within the limits that differ from `q` by whole turns of the masked joints.
 
         In the first row, each such joint is as close to `start` as possible. In each further row, one such
-        joint reaches `q` by turning in the other direction, since obstacles may block the short way. In a
-        last row, several continuous joints do, and none of them passes half a turn, where elbows fold.
+        joint reaches `q` by turning in the other direction, since obstacles may block the short way. If
+        several continuous joints of the first row are more than half a turn from 0, a last row has all of
+        them within half a turn of 0, since elbows fold at half a turn.
         """
         nearest = self._turned(q, start, joints)
         rows = [nearest]
@@ -278,6 +280,7 @@ class KinematicTree(Value):
         if not joints.any():
             return q
         limited = joints & ~self.continuous
+        start = np.where(limited, np.clip(start, self.lower, self.upper), start)
         nearest = np.where(joints, q - TURN * np.round((q - start) / TURN), q)
         nearest = np.where(limited & (nearest > self.upper), nearest - TURN, nearest)
         return np.where(limited & (nearest < self.lower), nearest + TURN, nearest)
@@ -385,8 +388,7 @@ class KinematicTree(Value):
         frames = self.frames_at(q[None])
         parts = [np.zeros((0, 4))]
         for link, spheres in self.spheres.items():
-            T = frames[self.link_frame(link)][0] @ self.T_frame_link(link)
-            parts.append(moved_spheres(T, spheres))
+            parts.append(moved_spheres(frames[self.link_frame(link)][0] @ self.T_frame_link(link), spheres))
         return np.concatenate(parts)
 
     @cached_property
@@ -396,12 +398,14 @@ class KinematicTree(Value):
         The shoulder is the point on the first joint's axis that is nearest to the second joint, or to the
         first if it is the only one. With several arms, the largest reach of an arm is returned.
         """
-        q = np.random.default_rng(0).uniform(self.lower, self.upper, (REACH_SAMPLES, self.dof))
-        frames = self.frames_at(q)
+        if not self.dof:
+            return 0.0
+        rng = np.random.default_rng(0)
+        frames = self.frames_at(rng.uniform(self.lower, self.upper, (REACH_SAMPLES, self.dof)))
         reached = []
         chains = [*map(self.chain, self.tips)]
         for tip, chain in zip(self.tips, chains, strict=True):
-            # all joints of this arm alone are locked
+            # the joints that only this arm has are all locked
             if any({*chain} < {*longer_chain} for longer_chain in chains):
                 continue
             offsets = self.frame_offsets[list(chain[:2])]

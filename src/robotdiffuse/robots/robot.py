@@ -21,10 +21,12 @@ from robotdiffuse.core.errors import (
     check_name,
     check_type,
     counted,
+    joined,
     numbers,
     rigid_transform,
     shown,
     unknown_name,
+    vector,
     within,
 )
 from robotdiffuse.core.settings import Natural, converted
@@ -174,7 +176,7 @@ class Robot(KinematicTree):
     """Original collision meshes of the URDF, for the links in `grazing`. The convex `meshes` enclose them."""
     grazing: frozenset[frozenset[str]] = frozenset()
     """Pairs of links that pass so close that their convex `meshes` may overlap although their `surfaces` do
-    not touch; see `collision.surface_pairs`."""
+    not touch; see `collision.exact_meshes`."""
 
     def fk(self, q: ArrayLike, link: str | None = None) -> ndarray:
         """Forward kinematics: the pose of a link in the frame of the base.
@@ -262,7 +264,7 @@ class Robot(KinematicTree):
         from robotdiffuse.robots.inverse_kinematics import inverse_kinematics  # compiled code
 
         rng = np.random.default_rng(converted("seed", Natural, seed))
-        near_configuration = None if near is None else configurations(self, near)
+        near_configuration = None if near is None else vector("ik", "near", near, self.dof)
         name = self.tip if link is None else link
         return inverse_kinematics(self, name, cast(ndarray, pose), count, rng=rng, near=near_configuration)
 
@@ -283,8 +285,9 @@ class Robot(KinematicTree):
         """Lock joints at values. Joints that mimic them follow.
 
         Values may exceed the URDF's limits by up to the joint's range, since some published problems open
-        grippers that far; pairs of links that never collide within the limits stay unchecked there. Calls
-        with equal values return the same object.
+        grippers that far; pairs of links that never collide within the limits stay unchecked there. If the
+        limits are equal, as for a revolute wheel without limits in the URDF (both are then 0), the joint may
+        be locked at any value. Calls with equal values return the same object.
 
         Args:
             locked: Values [rad] or [m] by joint name. Planned joints may be locked as well.
@@ -300,12 +303,16 @@ class Robot(KinematicTree):
         movable = {joint.name: joint for joint in self.joints if joint.kind in MOVING_KINDS}
         for name, value in locked.items():
             check_name("joint in locked", name, movable)
-            if not isinstance(value, Real) or not abs(value) <= MAX_COORDINATE:
+            number = isinstance(value, Real) and not isinstance(value, bool)
+            if not number or not abs(value) <= MAX_COORDINATE:
                 raise InputError(
                     f"locked: {name} is {shown(value)}; it must be a number within ±{MAX_COORDINATE:g}"
                 )
             lower = movable[name].lower
             upper = movable[name].upper
+            mimic = movable[name].mimic
+            if mimic is not None and mimic.joint in {*self.locked, *locked}:
+                continue  # its value is checked below
             if lower < upper and not 2 * lower - upper <= value <= 2 * upper - lower:
                 raise InputError(
                     f"locked: {name} is {value:g}; it is far beyond its limits, {lower:g} to {upper:g}"
@@ -357,8 +364,7 @@ class Robot(KinematicTree):
         """
         check_type("attached", shape, RigidShape, "a shape, e.g. rd.Box")
         check_list("attached.touch_links", touch_links, str, "names of links")
-        T_link_body = shape.solid()[0]
-        return self.with_body(AttachedBody(shape.name, link, T_link_body, (shape,), tuple(touch_links)))
+        return self.with_body(AttachedBody(shape.name, link, shape.solid()[0], (shape,), tuple(touch_links)))
 
     def with_tool(
         self,
@@ -430,8 +436,7 @@ class Robot(KinematicTree):
         Raises:
             InputError: For an unknown name, and for a body to which another body is attached.
         """
-        names = [body.name for body in self.attached]
-        check_name("body to detach:", name, names)
+        check_name("body to detach:", name, [body.name for body in self.attached])
         held_bodies = [body.name for body in self.attached if body.link == name]
         if held_bodies:
             raise InputError(
@@ -594,13 +599,23 @@ def check_robot(robot: object) -> None:
     check_type("robot", robot, Robot, "a Robot, e.g. rd.load_robot('panda')")
 
 
+def check_joints(what: str, joint_names: Sequence[str], robot: Robot) -> None:
+    """Raises InputError unless the joints of a motion, named `what`, are the planned joints of the robot."""
+    if tuple(joint_names) != robot.joint_names:
+        names = joined(joint_names)
+        right = joined(robot.joint_names)
+        raise InputError(f"{what}.joint_names is {names}; the robot's planned joints are {right}")
+
+
 def configurations(robot: Robot, q: ArrayLike) -> ndarray:
-    """q as an array: a configuration [dof], or several [n, dof]. Raises InputError for other values."""
+    """q as an array: a configuration [dof], or several [n, dof]. Raises InputError for other shapes, and for
+    numbers that are not finite or not within ±MAX_COORDINATE."""
     rows = numbers(q)
     if rows is None or rows.ndim not in (1, 2) or rows.shape[-1] != robot.dof or not within(rows):
         names = ", ".join(robot.joint_names)
         raise InputError(
-            f"q is {shown(q)}; it must be {counted(robot.dof, 'number')}, or rows of them: {names}"
+            f"q is {shown(q)}; it must be {counted(robot.dof, 'number')}, or rows of them: {names}; "
+            f"each finite and within ±{MAX_COORDINATE:g}"
         )
     return rows
 

@@ -12,10 +12,10 @@ import json
 import os
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from tempfile import TemporaryFile
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -23,15 +23,23 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import (
     MAX_COORDINATE,
+    MAX_RATE,
     MIN_RATE,
     InputError,
-    described,
+    reading,
     shown,
     unit_quaternion,
     within,
 )
-from robotdiffuse.core.input_files import is_file, read_arrays, read_json
-from robotdiffuse.core.output_files import lock_folder, write_atomically, writing
+from robotdiffuse.core.files import (
+    JsonObject,
+    is_file,
+    lock_folder,
+    read_arrays,
+    read_json,
+    write_atomically,
+    writing,
+)
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.robots.bodies import ConvexMesh, Surface, inertia_of
 from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT, LIMITS, MOVING_KINDS, Joint, Mimic
@@ -64,32 +72,37 @@ FILE_ENDINGS = (".urdf", ".xacro", ".xml", ".sdf", ".usd", ".usda", ".usdc", ".u
 MESH_FILE = "meshes.npz"
 
 
-def write_robot_folder(robot: Robot, folder: str | Path, source: dict[str, Any]) -> None:
+def write_robot_folder(robot: Robot, folder: str | Path, source: JsonObject) -> None:
     """Write meshes.npz, for grazing links surfaces.npz, and robot.json into a folder. Each file is written
     atomically; other files in the folder stay.
 
-    `source` describes the robot's origin by the keys urdf, sha256 and license. If preparation measured them,
-    it also has `free`, the fraction of configurations that are free, and `refused`, the fraction of the free
+    `source` describes the robot's origin by the keys urdf, sha256 and license; also by srdf, the digest of
+    the SRDF that belongs to the URDF, unless another SRDF was given. If preparation measured them, it also
+    has `free`, the fraction of configurations that are free, and `refused`, the fraction of the free
     configurations in which covering spheres collide falsely. Raises InputError if the folder cannot be
     written.
     """
     folder = Path(folder)
     arrays = _packed([(link, mesh) for link, meshes in robot.meshes.items() for mesh in meshes])
+    files = {MESH_FILE: _npz(arrays)}
+    if robot.grazing:
+        arrays = _packed([*robot.surfaces.items()])
+        arrays |= {
+            "vertices": arrays["vertices"].astype(np.float32),  # relative error of at most 6e-8
+            "faces": arrays["faces"].astype(np.int32),
+            "grazing": np.array(sorted(sorted(pair) for pair in robot.grazing), np.str_),
+            "of": np.array(_digest(robot)),
+        }
+        files[SURFACE_FILE] = _npz(arrays)
+    # last: without this file, a folder that was written in part is not read
+    files[ROBOT_FILE] = f"{_dump(_to_json(robot, source))}\n".encode()
     with writing(folder), lock_folder(folder):
+        with TemporaryFile(dir=folder) as trial:  # on a full disk, existing files stay
+            trial.writelines(files.values())
         for file in (ROBOT_FILE, SURFACE_FILE):  # existing files may belong to other meshes
             (folder / file).unlink(missing_ok=True)
-        write_atomically(folder / MESH_FILE, _npz(arrays))
-        if robot.grazing:
-            arrays = _packed([*robot.surfaces.items()])
-            arrays |= {
-                "vertices": arrays["vertices"].astype(np.float32),  # relative error of at most 6e-8
-                "faces": arrays["faces"].astype(np.int32),
-                "grazing": np.array(sorted(sorted(pair) for pair in robot.grazing), np.str_),
-                "of": np.array(_digest(robot)),
-            }
-            write_atomically(folder / SURFACE_FILE, _npz(arrays))
-        # last: without this file, a folder that was written in part is not read
-        write_atomically(folder / ROBOT_FILE, _dump(_to_json(robot, source)) + "\n")
+        for file, content in files.items():
+            write_atomically(folder / file, content)
 
 
 def _npz(arrays: dict[str, ndarray]) -> bytes:
@@ -104,10 +117,10 @@ def read_robot_folder(folder: str | Path) -> Robot:
     data = _read_json(folder / ROBOT_FILE)
     meshes: dict[str, tuple[ConvexMesh, ...]] = {}
     arrays = read_arrays(folder / MESH_FILE)
-    with _damage(folder / MESH_FILE):
+    with reading(folder / MESH_FILE):
         for link, mesh in _unpacked(arrays, ConvexMesh):
             meshes[link] = (*meshes.get(link, ()), mesh)
-    with _damage(folder / ROBOT_FILE):
+    with reading(folder / ROBOT_FILE):
         robot = _from_json(data, meshes)
         _check_tree(robot)
         robot.frame_offsets  # noqa: B018  (walks the tree: fails if a joint has no parent)
@@ -117,7 +130,7 @@ def read_robot_folder(folder: str | Path) -> Robot:
     if not is_file(file):
         return robot
     arrays = read_arrays(file)
-    with _damage(file):
+    with reading(file):
         if str(arrays["of"]) != _digest(robot):
             raise ValueError("it belongs to other convex meshes; create the robot again")
         surfaces = dict(_unpacked(arrays, Surface))
@@ -126,15 +139,6 @@ def read_robot_folder(folder: str | Path) -> Robot:
             raise ValueError("grazing pairs and surfaces must name the same links of the robot")
         robot = replace(robot, surfaces=surfaces, grazing=grazing)
     return robot
-
-
-@contextmanager
-def _damage(file: Path) -> Iterator[None]:
-    """Turns errors that damaged data raises into an InputError that names the file."""
-    try:
-        yield
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise InputError(f"{file} is damaged: {described(error)}") from None
 
 
 def _digest(robot: Robot) -> str:
@@ -163,17 +167,18 @@ def _check_tree(robot: Robot) -> None:
     table_links = {link for table in robot.tables for link in table.links}
     if not {*robot.tips, *robot.meshes, *table_links} <= links:
         raise ValueError("the tip, a mesh or a table names a link that no joint has")
-    if any((rows[:, 3] <= 0).any() for rows in robot.spheres.values() if len(rows)):
-        raise ValueError("spheres without a size")
+    for link, rows in robot.spheres.items():
+        if (rows[:, 3] <= 0).any():
+            raise ValueError(f"spheres of {link}: a radius is {rows[:, 3].min():g}; it must be positive")
 
 
-def read_source(folder: str | Path) -> dict[str, Any]:
+def read_source(folder: str | Path) -> JsonObject:
     """The `source` of a robot folder, as given to `write_robot_folder`."""
     source = _read_json(Path(folder) / ROBOT_FILE).get("source", {})
     return source if isinstance(source, dict) else {}
 
 
-def _to_json(robot: Robot, source: dict[str, Any]) -> dict:
+def _to_json(robot: Robot, source: JsonObject) -> dict:
     return {
         "format": FORMAT,
         "name": robot.name,
@@ -200,13 +205,12 @@ def _to_json(robot: Robot, source: dict[str, Any]) -> dict:
 def _table_to_json(table: LinkPairTable) -> dict:
     """JSON entry of a table. Cells along the last joint are packed as bits; each row is a hexadecimal
     string."""
-    rows = np.packbits(np.atleast_2d(table.apart), axis=1)
     return {
         "links": list(table.links),
         "joints": list(table.joints),
         "lower": list(table.lower),
         "upper": list(table.upper),
-        "apart": [row.tobytes().hex() for row in rows],
+        "apart": [row.tobytes().hex() for row in np.packbits(np.atleast_2d(table.apart), axis=1)],
     }
 
 
@@ -281,8 +285,7 @@ def _from_json(data: dict, meshes: dict[str, tuple[ConvexMesh, ...]]) -> Robot:
 def _joint_from_json(data: dict) -> Joint:
     name = str(data["name"])
     kind = str(data["kind"])
-    T = _pose_from_json(data, f"joint {name}")
-    ends = (name, kind, str(data["parent"]), str(data["child"]), T)
+    ends = (name, kind, str(data["parent"]), str(data["child"]), _pose_from_json(data, f"joint {name}"))
     if kind == "fixed":
         return Joint(*ends)
     if kind not in MOVING_KINDS:
@@ -293,7 +296,9 @@ def _joint_from_json(data: dict) -> Joint:
     if not (
         -MAX_COORDINATE <= lower <= upper <= MAX_COORDINATE and MIN_RATE <= min(rates) <= max(rates) < np.inf
     ):
-        raise ValueError(f"joint {name}: lower is above upper, or a limit is out of range")
+        raise ValueError(
+            f"joint {name} has {limits}; they must be finite, in order and at least {MIN_RATE:g} for rates"
+        )
     if not abs(np.linalg.norm(axis) - 1) < AXIS_LENGTH_TOLERANCE:
         raise ValueError(f"joint {name}: an axis of length 1 expected")
     if kind == "continuous":
@@ -303,8 +308,8 @@ def _joint_from_json(data: dict) -> Joint:
         master, multiplier, offset = data["mimic"]
         mimic = Mimic(str(master), float(multiplier), float(offset))
     effort = float(data.get("effort", 0.0))
-    if not 0 <= effort <= MAX_COORDINATE:
-        raise ValueError(f"joint {name}: effort is {effort:g}; it must be from 0 to {MAX_COORDINATE:g}")
+    if not 0 <= effort <= MAX_RATE:
+        raise ValueError(f"joint {name}: effort is {effort:g}; it must be from 0 to {MAX_RATE:g}")
     return Joint(*ends, axis, **limits, mimic=mimic, effort=effort)
 
 

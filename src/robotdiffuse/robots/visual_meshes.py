@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from importlib.resources import as_file, files
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Int, UInt8
 from numpy import ndarray
 
-from robotdiffuse.core.types import Value
+from robotdiffuse.core.types import Points, Value
 from robotdiffuse.robots.robot import Robot
 
 UNIT = 5e-5
@@ -25,7 +25,7 @@ TOOL_COLOR = (0xB0, 0xB6, 0xBE)
 class VisualMesh(Value):
     """A triangle mesh in the frame of its link [m], with one sRGB color per face."""
 
-    vertices: Float[ndarray, "v 3"]
+    vertices: Points
     faces: Int[ndarray, "f 3"]
     colors: UInt8[ndarray, "f 3"]
 

@@ -6,10 +6,11 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.core.errors import MAX_RPY, InputError, check_name, located, shown, vector
-from robotdiffuse.core.input_files import known_ending, read_array
+from robotdiffuse.core.files import JsonObject, known_ending, read_array
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
 from robotdiffuse.scenes.point_cloud import default_radius, read_points
@@ -35,7 +36,7 @@ FILE_CONTENT = {"mesh": ("vertices", "faces"), "point_cloud": ("points",), "heig
 
 def check_fields(
     where: str, data: object, required: Iterable[str], optional: Iterable[str] = ()
-) -> dict[str, Any]:
+) -> JsonObject:
     """The data, with a field `rpy` converted to `wxyz`.
 
     Raises InputError unless `data` is a mapping with all required fields and without unknown fields.
@@ -118,16 +119,25 @@ def _shape(where: str, kind: type[Shape], values: object, folder: Path, notes: l
             raise InputError(f"{where}.file is {shown(values['file'])}; it must be the name of a file")
         values["file"] = str(folder / values["file"])
         with located(where):
-            if kind is PointCloud:
-                values.setdefault("point_radius", default_radius(values["file"]))
+            if kind is PointCloud and "point_radius" not in values:
+                values["point_radius"] = default_radius(values["file"])
             arrays = _content(kind, values["file"], notes)
         values |= dict(zip(content, arrays, strict=True))
     else:
         values = check_fields(where, values, required, optional)
+        if kind is HeightMap:
+            values = {**values, "heights": _with_holes(values["heights"])}
     try:
         return kind(**values)
-    except InputError as error:
+    except InputError as error:  # its message begins with the kind
         raise InputError(f"{where.removesuffix(kind.kind)}{error}") from None
+
+
+def _with_holes(heights: Any) -> Any:
+    """The heights of a file, with NaN in place of null."""
+    if isinstance(heights, list):
+        return [_with_holes(height) for height in heights]
+    return float("nan") if heights is None else heights
 
 
 def _content(kind: type[Shape], file: str, notes: list[str]) -> tuple[ndarray, ...]:
@@ -150,6 +160,10 @@ def scene_entries(scene: Scene, folder: Path | None) -> list[dict[str, dict[str,
         file = getattr(shape, "file", None)
         if file is None:
             values = plain_fields(shape, "file")
+            if isinstance(shape, HeightMap):  # JSON has no NaN: holes are null
+                heights = shape.heights.astype(object)
+                heights[np.isnan(shape.heights)] = None
+                values["heights"] = heights.tolist()
         else:
             values = plain_fields(shape, "file", *FILE_CONTENT[shape.kind])
             values = {"file": name_from(folder, Path(file)), **values}
@@ -161,7 +175,7 @@ def scene_entries(scene: Scene, folder: Path | None) -> list[dict[str, dict[str,
     return entries
 
 
-def plain_fields(value: Any, *left_out: str) -> dict[str, Any]:
+def plain_fields(value: Any, *left_out: str) -> JsonObject:
     """The fields of a dataclass by name, with lists in place of arrays."""
     names = [field.name for field in fields(value) if field.name not in left_out]
     content = [getattr(value, name) for name in names]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, reading, shown
-from robotdiffuse.core.input_files import file_name, input_file, known_ending, read_array, read_bytes
+from robotdiffuse.core.files import file_name, input_file, known_ending, read_array, read_bytes
 from robotdiffuse.core.mesh_files import check_ply
 from robotdiffuse.core.types import Points, Vector
 
@@ -36,7 +36,8 @@ def read_octomap(file: str | Path) -> tuple[Points, float]:
     """The centers of a .bt file's occupied voxels [m], and the edge of a voxel [m].
 
     An occupied leaf above the lowest level is a cube of voxels, of which only the voxels at the surface are
-    returned. Raises InputError for a file that is not of this format, or damaged.
+    returned. Raises InputError for a file that is missing, not of this format or damaged, and for more than
+    MAX_VOXELS occupied voxels.
     """
     content = read_bytes(file, "octomap")
     header, separator, data = content.partition(b"\ndata\n")
@@ -58,7 +59,7 @@ def read_octomap(file: str | Path) -> tuple[Points, float]:
         edge = float(fields["res"])
         return occupied_voxels(data, edge), edge
     except ValueError as error:
-        raise InputError(f"octomap {file} is damaged: {error}") from None
+        raise InputError(f"octomap {file} cannot be read: {error}") from None
 
 
 def cover_radius(edge: float) -> float:
@@ -122,7 +123,7 @@ UTF8 = "utf-8-sig"
 POINT_RADIUS = 0.01
 """Default radius of points [m]."""
 MAX_COLUMNS = 1000
-"""Arrays with more columns hold points as columns, not as rows."""
+"""Arrays with more columns are refused, since they seem to hold the points as columns."""
 
 
 def voxel_thin(points: Points, voxel: float) -> Points:
@@ -204,23 +205,28 @@ def _read_text(file: Path) -> ndarray:
     """Columns of numbers, separated by commas or blanks. The first line may be a header with the names of the
     columns."""
     with file.open(encoding=UTF8) as stream:
-        first = stream.readline()
-    delimiter = "," if "," in first else None
-    names = [name.strip().strip('"').lower() for name in first.lstrip("#/ ").split(delimiter)]
+        lines = ((number, line) for number, line in enumerate(stream) if line.strip())
+        at, first = next(lines, (0, ""))
+        following = next((line for _, line in lines if line.lstrip()[0] != "#"), "")
+    names = [name.strip().strip('"').lower() for name in first.lstrip("#/ ").split(_delimiter(first))]
     header = False
     try:
-        float((names or "0")[0])
+        float(names[0] if names else "")
     except ValueError:
         header = True
     named = {"x", "y", "z"} & {*names}
     if header and named and len(named) < 3 and first[0] not in "#/":
         raise InputError(f"it has the columns {shown(names)}; it must have x, y and z")
     columns = [names.index(axis) for axis in "xyz"] if header and len(named) == 3 else None
-    if header and not file.read_text(UTF8).partition("\n")[2].strip():
+    if header and not following:
         return np.zeros((0, 3))
-    return np.loadtxt(
-        file, delimiter=delimiter, skiprows=int(header), usecols=columns, ndmin=2, encoding=UTF8
-    )
+    delimiter = _delimiter(following if header else first)
+    skipped = at + int(header)
+    return np.loadtxt(file, delimiter=delimiter, skiprows=skipped, usecols=columns, ndmin=2, encoding=UTF8)
+
+
+def _delimiter(line: str) -> str | None:
+    return "," if "," in line else None
 
 
 def _read_pcd(file: Path) -> ndarray:
@@ -271,8 +277,8 @@ def lzf_unpacked(packed: bytes, size: int) -> bytes:
     """Unpacks data that LibLZF packed; `size` is the unpacked size [bytes].
     https://oldhome.schmorp.de/marc/liblzf.html
 
-    Raises ValueError if the unpacked size differs, and IndexError if the data end too soon. Unpacking stops
-    when the size is exceeded.
+    Raises ValueError if the unpacked size differs or the data repeat bytes from before the beginning, and
+    IndexError if they end within a repetition. Unpacking stops when the size is exceeded.
     """
     out = bytearray()
     at = 0

@@ -4,10 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Int8
+from jaxtyping import Float, Float32, Int, Int8
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Mask
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Shape, Sphere
 
@@ -37,7 +38,7 @@ class PackedScenes:
     def __len__(self) -> int:
         return len(self.kinds)
 
-    def __getitem__(self, rows: slice | Int[ndarray, "m"] | Bool[ndarray, "n"]) -> "PackedScenes":
+    def __getitem__(self, rows: slice | Int[ndarray, "m"] | Mask) -> "PackedScenes":
         floors = None if self.floors is None else self.floors[rows]
         return PackedScenes(self.kinds[rows], self.params[rows], floors)
 

@@ -75,7 +75,7 @@ class Shape(Value, ABC):
     def T_base_shape(self) -> Pose:
         """Pose of the shape's own frame. Raises InputError for shapes without a pose, such as point
         clouds."""
-        raise self._not_solid()
+        raise InputError(f"{self.name!r} is a {self.kind}, which has no pose; use another kind of shape")
 
     def moved(self, T: Pose) -> "Shape":
         """Move the shape.
@@ -367,7 +367,7 @@ class PointCloud(Shape):
             The cloud.
 
         Raises:
-            InputError: For a file that cannot be read, or a scale that is not positive.
+            InputError: For a file that cannot be read, or a scale or point_radius that is not positive.
         """
         points, notes = read_points(file)
         for note in notes:
@@ -475,20 +475,22 @@ class Mesh(_Posed, Triangulated):
         scale: float = 1.0,
         name: str = "mesh",
     ) -> "Mesh":
-        """Read a mesh from a file of a format that trimesh reads (.stl, .obj, .ply, .dae, .glb, ...).
+        """Read a mesh from a .dae, .glb, .gltf, .obj, .off, .ply or .stl file.
 
         Args:
             file: The file.
             xyz: Position of the file's frame in the frame of the base [m].
             wxyz: Orientation of the file's frame, a quaternion.
-            scale: Meters for each unit of the file: 0.001 for millimeters.
+            scale: Meters for each unit of the file: 0.001 for millimeters. The <unit> of a .dae file is
+                applied before, so 1 is right for such a file.
             name: Name of the obstacle, for messages and allowed contacts.
 
         Returns:
             The mesh, of all parts of the file.
 
         Raises:
-            InputError: For a file that cannot be read, or a scale that is not positive.
+            InputError: For a file that cannot be read, a scale that is not positive, and an xyz or wxyz that
+                is no position or quaternion.
         """
         vertices, faces = read_triangles(file)
         scale = positive("mesh", "scale", scale)
@@ -551,15 +553,18 @@ class HeightMap(_Posed, Triangulated):
             raise InputError(
                 f"height_map.heights is {form(heights)}; it must be rows x columns, at least 2 x 2"
             )
-        absolute = np.abs(heights[~np.isnan(heights)])
-        if not (absolute <= MAX_COORDINATE).all():
-            raise InputError(f"height_map.heights has numbers that are not within ±{MAX_COORDINATE:g} m")
+        largest = np.nanmax(np.abs(heights), initial=0.0)
+        if largest > MAX_COORDINATE:
+            raise InputError(
+                f"height_map.heights has a number of size {largest:g}; "
+                f"all must be within ±{MAX_COORDINATE:g} m"
+            )
         object.__setattr__(self, "heights", heights)
         super().__post_init__()
         if not len(self._faces):
             raise InputError("height_map.heights has no cell with heights at all four corners")
 
-    @property
+    @cached_property
     def _faces(self) -> ndarray:
         index = np.arange(self.heights.size).reshape(self.heights.shape)
         corners = [index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]]

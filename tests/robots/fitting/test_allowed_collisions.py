@@ -18,7 +18,7 @@ from robotdiffuse.robots.fitting import self_collisions
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, Surface, convex_hull
 from robotdiffuse.robots.fitting.covering_spheres import cover
 from robotdiffuse.robots.fitting.preparation import AddReport, PreparationSettings, Prepared, prepare
-from robotdiffuse.robots.fitting.sampled_links import Links, joint_table
+from robotdiffuse.robots.fitting.self_collisions import Links, joint_table
 from robotdiffuse.robots.fitting.sphere_fitting import SphereSettings
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import ConvexMesh, LinkPairTable, Robot
@@ -251,8 +251,7 @@ def test_a_table_is_left_aside_where_a_joint_is_held_or_its_joints_are_others() 
     refused, wrong = shares(robot)
     assert refused == 0.0 and wrong > 0
     (table,) = robot.tables
-    others = replace(robot, tables=(replace(table, joints=table.joints[::-1]),))
-    for other in (robot.with_locked({"spin": 0.3}), others):
+    for other in (robot.with_locked({"spin": 0.3}), replace(robot, tables=(replace(table, joints=table.joints[::-1]),))):
         assert shares(other) == (1.0, 0)
 
 

@@ -43,14 +43,11 @@ def test_parts_hold_all_of_the_mesh(name: str) -> None:
         assert solid.is_convex and solid.is_watertight and solid.volume > 0
 
 
-def test_an_l_is_two_parts_of_its_own_volume() -> None:
+def test_an_l_is_two_parts_of_its_own_volume_and_a_frame_stays_open() -> None:
     parts = parts_of("L")
     assert len(parts) <= 4
     assert sum(trimesh.Trimesh(part.vertices, part.faces).volume for part in parts) == pytest.approx(0.1 * 0.1 * 0.6, rel=0.1)
-
-
-def test_a_frame_stays_open() -> None:
-    """No single cut reduces the volume of the hull; cutting must continue nevertheless."""
+    # No single cut reduces the volume of the hull; cutting must continue nevertheless.
     parts = parts_of("frame")
     assert 4 <= len(parts) <= 6
     assert beyond(parts, np.array([[0.2, 0.05, 0.2]]))[0] > 0.1

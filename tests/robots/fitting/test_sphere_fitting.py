@@ -96,15 +96,12 @@ def test_nothing_reaches_below_the_floor() -> None:
     assert covered(meshes, spheres) and (spheres[:, 2] - spheres[:, 3]).min() > -1e-3
 
 
-def test_a_ball_needs_one_sphere() -> None:
+def test_a_ball_needs_one_sphere_and_a_small_gap_is_found() -> None:
     ball = (convex_hull(np.array(trimesh.creation.icosphere(2, 0.05).vertices)),)
     spheres = fit_spheres(Solid.of(ball, 0.01), Bounds(0.01), np.random.default_rng(0), QUICK)
     assert len(spheres) == 1
     assert np.linalg.norm(spheres[0, :3]) < 3e-3
     assert spheres[0, 3] == pytest.approx(0.05, abs=3e-3)
-
-
-def test_covered_finds_a_small_gap() -> None:
     meshes = (box((0.1, 0.1, 0.1)),)
     spheres = np.array([[0, 0, 0, 0.05 * 3**0.5 + 1e-5]])
     assert covered(meshes, spheres)

@@ -8,6 +8,7 @@ from helpers.example_robots import urdf_file
 from helpers.made_arms import chain, joint, link, read_urdf, row, written
 from helpers.refusals import refuses
 from robotdiffuse.robots.parsing.srdf import read_srdf, srdf_beside
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 
 ARM = chain("base", row("j", 6))
@@ -40,15 +41,12 @@ def test_grippers_and_hands_are_known_and_held(parts: str, tip: str, tmp_path: P
     assert robot.locked.keys() == {j.name for j in robot.joints if j.kind != "fixed"} - {*robot.joint_names}
 
 
-def test_a_word_that_all_joints_have_is_no_gripper(tmp_path: Path) -> None:
+def test_a_gripper_is_no_word_that_all_joints_have_and_is_planned_if_the_tip_says_so(tmp_path: Path) -> None:
     """Regression: of a finger with three joints on a table, only the first was planned."""
     robot = read_urdf(written(tmp_path, chain("base", row("finger_", 3))))
     assert robot.tip == "finger_3_link"
     robot = read_urdf(written(tmp_path, chain("base", [*row("claw_", 4), "claw_jaw"])))
     assert robot.tip == "claw_4_link"
-
-
-def test_a_joint_called_gripper_is_planned_if_the_tip_says_so(tmp_path: Path) -> None:
     robot = read_urdf(written(tmp_path, ARM, chain("j6_link", ["gripper"])), tip="gripper_link")
     assert robot.joint_names == (*row("j", 6), "gripper")
 
@@ -104,6 +102,7 @@ def test_published_arms_end_where_their_grippers_begin(tmp_path: Path) -> None:
         ("so_arm_description/urdf/so100.urdf", "gripper", 5),
         ("z1_description/urdf/z1.urdf", "gripperStator", 6),
         ("tiago_description/robots/tiago.urdf", "hand_palm_link", 8),
+        ("kinova_description/robots/kinova.urdf", "j2s6s200_end_effector", 6),  # not the tip of a fixed finger
     ):
         robot = read_urdf(data / file)
         assert (robot.tip, robot.dof) == (tip, dof)
@@ -132,9 +131,10 @@ def test_mimics_of_planned_joints_raise_unless_these_are_locked_or_above_the_bas
     assert held.locked == {"rod": -0.5, "j2": 0.5} and held.dof == 5
     framed = read_urdf(written(tmp_path, ARM, bar.replace(link("bar"), link("bar", ""))))
     assert framed.dof == 6 and "the pose of bar is wrong" in "".join(framed.notes)
-    inside = link("end") + joint("last", "j6_link", "end", more='<mimic joint="j5"/>')
+    inside = link("end") + joint("last", "j6_link", "end", more='<mimic joint="j5" offset="0.2"/>')
     refuses("last mimics j5", read_urdf, written(tmp_path, ARM, inside), tip="end")
-    assert read_urdf(written(tmp_path, ARM, inside), tip="end", base="j5_link").locked == {"last": 0.0}
+    alone = read_urdf(written(tmp_path, ARM, inside), tip="end", base="j5_link")
+    assert alone.locked == {"last": 0.2} and "last mimics j5, which is above the base: it is held at 0.2" in alone.notes[-1]
 
 
 @pytest.mark.parametrize("followed", ["nobody", "rod", "other"])
@@ -144,20 +144,7 @@ def test_mimic_of_nothing_or_in_a_circle(followed: str, tmp_path: Path) -> None:
     refuses("another joint of the file and must not mimic", read_urdf, file)
 
 
-SRDF = """<robot name="made">
-  <group name="arm"><chain base_link="j1_link" tip_link="j6_link"/></group>
-  <group name="short"><joint name="j1"/><link name="j2_link"/></group>
-  <group name="hand"><joint name="grip"/></group>
-  <group name="all"><group name="arm"/><group name="hand"/></group>
-  <group name="wrong"><joint name="nobody"/></group>
-  <group name="circle"><group name="circle"/></group>
-  <group_state name="home" group="arm">
-    <joint name="j1" value="0.5"/><joint name="j3" value="9"/></group_state>
-  <group_state name="open" group="hand"><joint name="grip" value="0.7"/></group_state>
-  <passive_joint name="j4"/>
-  <disable_collisions link1="base" link2="j6_link" reason="User"/>
-  <disable_collisions link1="j1_link" link2="base" reason="Adjacent"/>
-</robot>"""
+SRDF = (Path(__file__).parents[2] / "files" / "groups.srdf").read_text()
 
 
 def test_groups_poses_and_passive_joints_of_an_srdf(tmp_path: Path) -> None:
@@ -198,3 +185,16 @@ def test_groups_poses_and_passive_joints_of_an_srdf(tmp_path: Path) -> None:
 def test_damaged_srdf(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "a.srdf").write_text(text)
     assert "a.srdf" in refuses(message, read_srdf, tmp_path / "a.srdf")
+
+
+def test_chains_of_mimic_joints(tmp_path: Path) -> None:
+    """Regressions: a joint that follows one that follows a fixed joint stayed; saved values of followers were refused."""
+
+    def made(b: str, c: str) -> Robot:
+        limbs = [joint("c", "j_link", "x", c), joint("b", "j_link", "y", b, more='<mimic joint="c"/>')]
+        limbs.append(joint("a", "j_link", "z", limits='lower="0" upper="0.2"', more='<mimic joint="b" multiplier="2"/>'))
+        return read_urdf(written(tmp_path, chain("base", ["j"]), *map(link, "xyz"), *limbs), tip="j_link")
+
+    held = made("revolute", "fixed").with_locked({"b": 0.5})
+    assert held.with_locked(held.locked).locked == {"b": 0.5, "a": 1.0}
+    assert made("fixed", "revolute").locked == {"c": 0.0, "a": 0.0}

@@ -111,8 +111,8 @@ class DistanceGrid(NamedTuple):
         return DistanceGrid(origin, pitch, ndimage.distance_transform_edt(free) * pitch)
 
     def near_tight(self, tight: Points, concavity: float) -> tuple["DistanceGrid", "DistanceGrid"]:
-        """Two copies in which distances near `tight` places are enlarged, so that parts that stick out there
-        have a larger concavity.
+        """Two copies with enlarged distances near `tight` places. So a part that sticks out there has a
+        larger concavity.
 
         At all other places, the first copy is zero, and the second copy has the original distances.
         """
@@ -372,9 +372,10 @@ def _merged(hulls: list[ConvexMesh], space: DistanceGrid, settings: PartSettings
 
 def _without_contained(hulls: list[ConvexMesh]) -> list[ConvexMesh]:
     """The hulls without those that another hull contains."""
-    remaining = sorted(hulls, key=lambda hull: float(np.prod(np.ptp(hull.vertices, axis=0))))
-    for hull in tuple(remaining):
-        other_planes = [planes_of(neighbor) for neighbor in remaining if neighbor is not hull]
-        if any((hull.vertices @ normals.T <= offsets).all() for normals, offsets in other_planes):
-            remaining.remove(hull)
-    return remaining
+    by_size = sorted(hulls, key=lambda hull: float(np.prod(np.ptp(hull.vertices, axis=0))))
+    remaining = {hull: planes_of(hull) for hull in by_size}
+    for hull, planes in tuple(remaining.items()):
+        del remaining[hull]
+        if not any((hull.vertices @ normals.T <= offsets).all() for normals, offsets in remaining.values()):
+            remaining[hull] = planes
+    return list(remaining)

@@ -21,18 +21,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, check_name, joined
-from robotdiffuse.core.output_files import lock_folder
+from robotdiffuse.core.errors import InputError, check_name, joined, shown
+from robotdiffuse.core.files import lock_folder
 from robotdiffuse.core.types import Mask, Points, Poses, Spheres
 from robotdiffuse.robots.bodies import Surface
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, convex_parts
-from robotdiffuse.robots.fitting.sampled_links import Links, joint_table
 from robotdiffuse.robots.fitting.self_collisions import (
     FalseCollisions,
+    Links,
     PairFalseCollisions,
     PairReport,
     SamplingSettings,
     find_allowed_collisions,
+    joint_table,
     measure_false_collisions,
 )
 from robotdiffuse.robots.fitting.sphere_fitting import (
@@ -65,8 +66,8 @@ GAP = 0.004
 """Points closer than this to a neighboring link count as inside it [m]: gaps between links are about this
 thin."""
 BOX_PADDING = 10 * GAP
-"""Points farther than this from a neighboring link's bounding box count as outside this link [m]; a multiple
-of GAP, because near sharp edges the distance from the face planes is smaller than the distance from the
+"""Points farther than this from a neighboring link's bounding box count as outside this link [m]. It is a
+multiple of GAP: near a sharp edge, a point may be closer than GAP to the face planes, but farther from the
 link."""
 
 
@@ -81,8 +82,8 @@ class Neighbor(NamedTuple):
 
 
 def neighbors(robot: Robot, link: str) -> tuple[Neighbor, ...]:
-    """Links with geometry that a joint connects to the given link. In place of a parent without geometry, the
-    nearest link with geometry above the parent counts, if only fixed joints lead from there to the parent."""
+    """Links with geometry that a joint connects to the given link. If a parent has no geometry, its own
+    parent takes its place, and so on, as long as fixed joints connect them."""
     adjacent = []
     for joint in robot.joints:
         above = joint.parent
@@ -145,8 +146,8 @@ def _joined(surfaces: Iterable[Surface]) -> Surface:
     corners = np.concatenate([surface.vertices[surface.faces].reshape(-1, 3) for surface in surfaces])
     vertices, index = np.unique(corners.astype(np.float32), axis=0, return_inverse=True)
     faces = index.reshape(-1, 3)
-    distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    return Surface(vertices.astype(np.float64), faces[distinct])
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    return Surface(vertices.astype(np.float64), faces)
 
 
 LARGE_REACH = 1.4
@@ -160,14 +161,14 @@ Progress = Callable[[str, int, int], None]
 CONCAVITY_SHRINKAGE = 0.5
 """Factor per round on `PartSettings.concavity` for links whose convex parts have many false collisions."""
 UNREFINED_FRACTION = 0.6
-"""The pairs of links with the fewest false collisions are not refined: as many pairs as together have at most
-this fraction of `max_false_collisions`."""
+"""Pairs of links with few false collisions are not refined. Together, these pairs have at most this fraction
+of `max_false_collisions`."""
 GAP_SHRINKAGE = 0.6
-"""Factor per round on `GAP_FRACTION`."""
+"""GAP_FRACTION is multiplied by this after each round."""
 GAP_FRACTION = 1.0
-"""Refinement limits how far spheres of two links stick out into a gap between the links: to this multiple of
-the gap, on average over the two links. Spheres on both sides may still overlap; further rounds lower the
-multiple. With 1.2, a UR5 needed a second round and got six more spheres, with as many false collisions."""
+"""Refinement limits how far the spheres of two links stick out into the gap between them: on average over the
+two links, to this fraction of the gap. At 1, spheres on both sides may still overlap; later rounds lower the
+fraction. With 1.2, a UR5 needed a second round and got six more spheres, with as many false collisions."""
 
 
 @dataclass(frozen=True)
@@ -219,7 +220,7 @@ class Prepared(NamedTuple):
     links: tuple[LinkReport, ...]
     pairs: tuple[PairReport, ...]
     sampled: tuple[PairReport, ...]
-    """Pairs of links as sampling classifies them; pairs that the caller allows do not count here."""
+    """Pairs of links as sampling alone classifies them; allowed collisions of the caller are ignored."""
     false_collisions: FalseCollisions
 
 
@@ -263,7 +264,7 @@ def prepare(
     """Computes convex parts, covering spheres and allowed pairs from the collision meshes of a robot's links.
 
     Args:
-        robot: The robot; its meshes, spheres and allowed collisions are replaced.
+        robot: The robot; its meshes, spheres, tables and allowed collisions are replaced.
         surfaces: Collision meshes by link, in the links' frames.
         settings: Tolerances and numbers of samples.
         seed: The same input and seed give the same robot.
@@ -272,10 +273,9 @@ def prepare(
     """
     # the reach is measured with prismatic joints locked, since a long rail does not make an arm larger
     slides = {j.name: (j.lower + j.upper) / 2 for j in robot.planned_joints if j.kind == "prismatic"}
-    arm_reach = 0.0 if len(slides) == robot.dof else robot.with_locked(slides).reach
-    settings = settings.for_reach(arm_reach)
+    settings = settings.for_reach(0.0 if len(slides) == robot.dof else robot.with_locked(slides).reach)
     links = {name: _Link(name, meshes, settings.parts) for name, meshes in surfaces.items()}
-    steps = 2 * len(links) + 1 + settings.rounds
+    steps = 2 * len(links) + 2 + settings.rounds
     for step, link in enumerate(links.values()):
         progress(f"convex parts of {link.name}", step, steps)
         robot = link.decompose(robot)
@@ -292,7 +292,7 @@ def prepare(
         for pair in sampled
     )
     allowed_pairs = frozenset(frozenset(pair.links) for pair in pairs if pair.reason != "checked")
-    robot = replace(robot, allowed_collisions=allowed_pairs)
+    robot = replace(robot, allowed_collisions=allowed_pairs, tables=())
     attempts = []
     for k in range(settings.rounds + 1):
         progress("false collisions", 2 * len(links) + 1 + k, steps)
@@ -338,6 +338,7 @@ def _refined(
     """The robot with finer parts and spheres, or with tables, for pairs of links with many false collisions;
     `k` is the number of refinements before."""
     worst_pairs = _worst(false_collisions, settings.max_false_collisions)
+    # tables replace spheres, so parts of a pair with a table change only where they are coarse
     table_pairs = {pair.links for pair in worst_pairs if _beyond_spheres(robot, pair, settings, k)}
     coarse_links = {
         name
@@ -366,8 +367,7 @@ def _refined(
         for pair in worst_pairs:
             if name in pair.links and pair.links not in table_pairs:
                 places = _shared(pair, name)
-                gaps = GAP_FRACTION * GAP_SHRINKAGE**k * places[:, 3]
-                places[:, 3] = np.maximum(gaps, settings.finest)
+                places[:, 3] = np.maximum(GAP_FRACTION * GAP_SHRINKAGE**k * places[:, 3], settings.finest)
                 link.narrow = np.concatenate([link.narrow, places])
         robot = link.fit(robot, settings.spheres, seed)
     return _with_tables(robot, table_pairs, coarse_links, settings)
@@ -413,19 +413,19 @@ def _with_tables(
 
 
 def _beyond_spheres(robot: Robot, pair: PairFalseCollisions, settings: PreparationSettings, k: int) -> bool:
-    """Whether even the finest spheres of a pair would collide falsely too often, or those of an earlier
-    refinement (`k` > 0) do, and one or two joints are between the links, so that a table can be used
-    instead."""
+    """Whether a table should replace the spheres of a pair: one or two joints are between the links, and even
+    the finest spheres would collide falsely too often, or those of an earlier refinement (`k` > 0) do."""
     narrow_fraction = (pair.gaps < 2 * settings.finest).mean() if len(pair.gaps) else 0.0
     if k:
         narrow_fraction = 1.0
+    # false collisions, beyond those of the parts, in gaps that are too narrow for the finest spheres
     hopeless = narrow_fraction * (pair.by_spheres - pair.by_parts) > settings.max_false_collisions / 3
     return bool(hopeless) and len(robot.joints_between(*pair.links)) in (1, 2)
 
 
 def _shared(pair: PairFalseCollisions, link: str) -> Spheres:
-    """Places x, y, z on one of two links, and twice the link's share of the gap there [m]: the average of the
-    two links' values is the gap.
+    """Rows x, y, z, w of places on one of two links: the link's share of the gap there is w / 2 [m]. So the
+    mean of w over the two links is the gap.
 
     Covering an area A takes about A / t spheres that stick out by t. Together the two links need the fewest
     spheres if they share the gap in proportion to the square roots of their areas.
@@ -435,8 +435,8 @@ def _shared(pair: PairFalseCollisions, link: str) -> Spheres:
 
 
 def _worst(false_collisions: FalseCollisions, allowed: float) -> list[PairFalseCollisions]:
-    """The pairs with the most false collisions, as few as possible: all other pairs together have at most
-    UNREFINED_FRACTION of the `allowed` fraction of false collisions."""
+    """The pairs with the most false collisions: the smallest number of them for which all other pairs
+    together have at most UNREFINED_FRACTION of the `allowed` fraction of false collisions."""
     remaining = sum(pair.by_spheres for pair in false_collisions.pairs)
     worst_pairs = []
     for pair in false_collisions.pairs:
@@ -476,7 +476,7 @@ MAX_PROPOSED = 3
 although no single pair always collides."""
 ASSUMED_SAFE = {
     "default": "also with all joints between them at zero: the meshes are assumed to be too large",
-    "limits": "which reach up to a limit of one joint: the limit is assumed to be where the links meet",
+    "limits": "up to a limit of one joint: the limit is assumed to be where the links meet",
     "pose": "also in a pose that the SRDF names: the meshes are assumed to be too large",
 }
 """Reasons for allowing a pair that a person should check, each with an explanation for the warning."""
@@ -561,7 +561,7 @@ def _touching_note(robot: Robot, allowed: Mapping[frozenset[str], str]) -> list[
         return []
     return [
         f"links that touch in all motions are not checked: {joined(touching)}; if joints between them are "
-        "held, --lock may hold them elsewhere"
+        "held, --lock can hold them at other values"
     ]
 
 
@@ -594,9 +594,10 @@ def add_robot(
         settings: Settings of the preparation.
         seed: The same input and seed give the same robot.
         progress: Called at each step.
-        srdf: Source of groups, poses and passive joints; by default the SRDF found beside the URDF. Only an
-            SRDF that is given here also allows pairs of links, which are then not checked. In both cases, the
-            report lists where sampling and the SRDF differ.
+        srdf: Source of groups, poses and passive joints; by default the SRDF found beside the URDF, or the
+            keyframes and exclusions of a MuJoCo model. An SRDF that is given here and a MuJoCo model also
+            allow pairs of links, which are then not checked; an SRDF that was found does not. The report
+            lists where sampling and this source differ.
         allow: Further pairs of links that are not checked.
         packages: Folders of ROS packages by name.
 
@@ -612,14 +613,14 @@ def add_robot(
     for pair in allow:
         for link in pair:
             check_name("link in allow", link, robot.link_names)
-        if len({*pair}) < 2:
-            raise InputError(f"allow names link {pair[0]} twice; it must name two links")
+        if len(pair) != 2 or pair[0] == pair[1]:
+            raise InputError(f"allow has the entry {shown(pair)}; it must name two links")
     name = name or robot.name
     ambiguous = out is None and (name in ROBOTS or name.endswith(FILE_ENDINGS) or "\\" in name)
     if ambiguous or Path(name).name != name or name.startswith(".") or not name.isprintable():
         raise InputError(
-            f"robot name is {name!r}; it must be a valid folder name, and no file or bundled robot: give "
-            f"--name NAME"
+            f"robot name is {name!r}; it must be a valid folder name, but not that of a file or a "
+            f"bundled robot: give --name NAME"
         )
     folder = user_robots() / name if out is None else Path(out)
     with lock_folder(folder):  # fails early if the folder cannot be written
@@ -631,10 +632,11 @@ def add_robot(
             f"{urdf}: no link has collision or visual geometry, so collisions cannot be checked; add "
             f"<collision> elements to its links"
         )
-    srdf_allowed = {} if semantics is None else semantics.allowed
+    srdf_allowed = {} if semantics is None else semantics.allowed_among(robot.link_names)
     named_links = frozenset[str]().union(*srdf_allowed)
     if srdf is not None and named_links and named_links.isdisjoint(tree.links):
         raise InputError(f"{srdf} is for another robot: it names no link of {urdf}; give its own SRDF")
+    # an SRDF that was found beside the URDF allows no pairs; a MuJoCo model does
     allowed = {pair: "srdf" for pair in srdf_allowed} if srdf is not None or srdf_file is None else {}
     allowed |= {frozenset(pair): "named" for pair in allow}
     surfaces = {link: tree.surfaces(link) for link in robot.meshes}
@@ -660,6 +662,7 @@ def add_robot(
             pair.links, pair.reason, pair.colliding, srdf_allowed.get(frozenset(pair.links), "checked")
         )
         for pair in prepared.sampled
+        # checked by one of the two, allowed by the other
         if semantics is not None and (pair.reason == "checked") == (frozenset(pair.links) in srdf_allowed)
     )
     source = {"urdf": Path(urdf).name, "sha256": tree.digest, "license": license}

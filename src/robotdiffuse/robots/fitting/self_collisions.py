@@ -1,26 +1,247 @@
 """Finds pairs of links that need no collision check against each other, and measures false collisions:
 configurations in which covering spheres or convex parts of two links collide although the true meshes do not.
+Makes tables for pairs of links that pass so close to each other that covering spheres overlap, such as a
+flange in a fork.
+
+The relative pose of two links depends only on the joints between them. For one or two such joints, a table
+over their values tells where the convex parts of the links are apart. A cell of the table counts as free if
+the links' distance at its center exceeds their largest relative motion from the center to a point of the
+cell. Other cells are split, down to a fraction of a millimeter of motion.
 """
 
 # Coal's Python module has no type information.
 # pyright: reportAttributeAccessIssue=false
-
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import coal
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.types import Points, Spheres, Values, for_kernels
-from robotdiffuse.robots.coal_geometry import coal_pose, coal_surface
+from robotdiffuse.core.transforms import ball_around
+from robotdiffuse.core.types import Configurations, Mask, Points, Poses, Spheres, Values, Vector, for_kernels
+from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose, coal_surface
 from robotdiffuse.robots.fitting.convex_parts import Surface, one_per_cube
-from robotdiffuse.robots.fitting.sampled_links import NEAR_DISTANCE, Links
-from robotdiffuse.robots.fitting.sphere_fitting_kernel import deepest_touches
-from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, Joint
-from robotdiffuse.robots.robot import Robot, moving_pairs
+from robotdiffuse.robots.fitting.sphere_fitting_kernel import ball_distances, deepest_touches
+from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, TURN, Joint, with_mimics
+from robotdiffuse.robots.motion_bounds import radii_of
+from robotdiffuse.robots.robot import LinkPairTable, Robot, moving_pairs
+
+BINS = 24
+"""Number of bins of a joint's range, to test whether the joint alone determines when two links collide."""
+MAX_STOPPED_RANGE = 5.2
+"""A joint with a range of at most this is taken to have mechanical stops at its limits [rad] or [m]; limits
+of wider ranges may be arbitrary."""
+MAX_UNEXPLAINED = 0.25
+"""Largest fraction of the variance of "the links collide" (0 or 1) that the value of one joint may leave
+unexplained. Below it, the joint is taken to decide whether they collide. If they do at one of its stops, the
+stop is taken to be where they meet, and the pair is not checked (the reason `limits` in
+`find_allowed_collisions`)."""
+BALL_MARGIN = 1e-9
+"""Margin of the balls around convex parts [m], larger than rounding errors."""
+NEAR_DISTANCE = 0.1
+"""For pairs of links that are farther apart than this in all samples, fewer searches for a collision are made
+[m]."""
+
+
+class Links:
+    """Poses of all links for batches of values of all movable joints, and collision tests of pairs of
+    links."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        names = {joint.name for joint in robot.joints}
+        movable = [joint for joint in robot.joints if joint.kind in MOVING_KINDS]
+        # a joint that mimics one above the base moves by itself
+        self.joints = [j for j in movable if j.mimic is None or j.mimic.joint not in names]
+        self.lower = np.array([joint.lower for joint in self.joints])
+        self.upper = np.array([joint.upper for joint in self.joints])
+        self.request, self.result = coal.CollisionRequest(), coal.CollisionResult()
+
+    @cached_property
+    def hulls(self) -> dict[str, list["coal.Convex"]]:
+        return {
+            link: [coal_convex(mesh.vertices, mesh.faces) for mesh in parts]
+            for link, parts in self.robot.meshes.items()
+        }
+
+    @cached_property
+    def balls(self) -> dict[str, Spheres]:
+        """Balls [x y z radius] around each part, by link [m]."""
+        around = {link: [ball_around(m.vertices) for m in parts] for link, parts in self.robot.meshes.items()}
+        return {link: np.array([[*c, r + BALL_MARGIN] for c, r in balls]) for link, balls in around.items()}
+
+    def random(self, count: int, rng: np.random.Generator) -> Configurations:
+        """Uniform values of all joints within their limits."""
+        return rng.uniform(self.lower, self.upper, (count, len(self.joints)))
+
+    def named(self, pose: dict[str, float]) -> Values:
+        """Values of all joints in a pose given by joint names. Joints that `pose` omits have their locked
+        value, else zero clipped to their limits."""
+        rest = self.robot.locked | pose
+        return np.array([rest.get(j.name, min(max(0.0, j.lower), j.upper)) for j in self.joints])
+
+    def stop_explains(self, joint: Joint, q: Configurations, colliding: Mask) -> bool:
+        """Whether the value of one joint alone determines if two links collide, and the links collide at one
+        of the joint's stops. `colliding` tells for each row of q whether they collide."""
+        if joint not in self.joints or not 0 < joint.upper - joint.lower <= MAX_STOPPED_RANGE:
+            return False
+        fraction = (q[:, self.joints.index(joint)] - joint.lower) / (joint.upper - joint.lower)
+        bin_index = np.minimum((fraction * BINS).astype(int), BINS - 1)
+        count = np.maximum(np.bincount(bin_index, minlength=BINS), 1)
+        colliding_fraction = np.bincount(bin_index, colliding, minlength=BINS) / count
+        unexplained = (colliding_fraction * (1 - colliding_fraction) * count).sum() / len(q)
+        variance = colliding.mean() * (1 - colliding.mean())
+        return bool(
+            max(colliding_fraction[0], colliding_fraction[-1]) > 0.99
+            and unexplained < MAX_UNEXPLAINED * variance
+        )
+
+    def poses(self, q: Configurations, wanted: Iterable[str] = ()) -> dict[str, Poses]:
+        """T_base_link [n, 4, 4] by link. With `wanted` links, only the poses of these links and of the links
+        on the way to them."""
+        chains = [self.robot.joints_above(link) for link in wanted or self.robot.link_names]
+        joints = dict.fromkeys(joint for chain in chains for joint in chain)
+        poses = {self.robot.base: np.tile(np.eye(4), (len(q), 1, 1))}
+        values = with_mimics(self.robot.joints, {joint.name: q[:, i] for i, joint in enumerate(self.joints)})
+        for joint in joints:
+            T_parent_child = joint.T_parent_joint
+            if joint.kind in MOVING_KINDS:
+                T_parent_child = T_parent_child @ joint.motion(values[joint.name])
+            poses[joint.child] = poses[joint.parent] @ T_parent_child
+        return poses
+
+    def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Values:
+        """Signed distances [n] between the covering spheres of two links [m]: lower bounds of the distances
+        of the links' meshes. Where the bounding balls of the links' spheres are more than NEAR_DISTANCE
+        apart, the distance of these two balls is given."""
+        first, second = (for_kernels(self.robot.spheres[link]) for link in (a, b))
+        return -deepest_touches(poses[a], poses[b], first, second, NEAR_DISTANCE, -np.inf)[0]
+
+    def _placed(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> tuple[Any, Any, ndarray]:
+        """Coal poses of two links in configuration i, and the distances [a, b] between the balls around their
+        parts [m]."""
+        ball_gaps = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
+        return coal_pose(poses[a][i]), coal_pose(poses[b][i]), ball_gaps
+
+    def collide(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> bool:
+        """Whether convex parts of two links collide in configuration i."""
+        return any(True for _ in self.contacts(poses, a, b, i))
+
+    def contacts(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> Iterator[Vector]:
+        """Points where convex parts of two links overlap in configuration i, one for each overlapping pair of
+        parts [m], in the base frame."""
+        T_a, T_b, ball_gaps = self._placed(poses, a, b, i)
+        for m, n in zip(*np.nonzero(ball_gaps <= 0), strict=True):
+            self.result.clear()
+            if coal.collide(self.hulls[a][m], T_a, self.hulls[b][n], T_b, self.request, self.result):
+                yield np.array(self.result.getContact(0).pos)
+
+    def mesh_distance(self, poses: dict[str, ndarray], a: str, b: str, i: int = 0) -> float:
+        """Distance between the convex parts of two links in configuration i [m]; zero or less if they
+        collide."""
+        T_a, T_b, ball_gaps = self._placed(poses, a, b, i)
+        min_distance = np.inf
+        for k in ball_gaps.argsort(axis=None):
+            m, n = divmod(int(k), ball_gaps.shape[1])
+            if ball_gaps[m, n] >= min_distance:
+                break
+            min_distance = min(min_distance, _distance(self.hulls[a][m], T_a, self.hulls[b][n], T_b))
+        return float(min_distance)
+
+    def part_distances(
+        self,
+        poses: dict[str, ndarray],
+        a: str,
+        b: str,
+        rows: Int[ndarray, "n"],
+        parts: Int[ndarray, "2 n"],
+        limit: float,
+    ) -> Values:
+        """Distances [n] between convex parts of two links [m]: entry k is for part parts[0, k] of link a and
+        part parts[1, k] of link b in configuration rows[k]. A distance above `limit` may be replaced by a
+        lower bound that is also above `limit`."""
+        balls = [self.balls[link][parts[k]] for k, link in enumerate((a, b))]
+        middles = [
+            np.einsum("nij,nj->ni", poses[link][rows, :3, :3], ball[:, :3]) + poses[link][rows, :3, 3]
+            for link, ball in zip((a, b), balls, strict=True)
+        ]
+        part_gaps = np.linalg.norm(middles[0] - middles[1], axis=1) - balls[0][:, 3] - balls[1][:, 3]
+        for k in np.flatnonzero(part_gaps <= limit):
+            T_a, T_b = (coal_pose(poses[link][rows[k]]) for link in (a, b))
+            part_gaps[k] = _distance(self.hulls[a][parts[0, k]], T_a, self.hulls[b][parts[1, k]], T_b)
+        return part_gaps
+
+
+def _distance(a: "coal.Convex", T_a: Any, b: "coal.Convex", T_b: Any) -> float:
+    """Signed distance of two convex parts at their poses [m]."""
+    return coal.distance(a, T_a, b, T_b, coal.DistanceRequest(), coal.DistanceResult())
+
+
+CELLS = 128
+"""Number of cells of a table along each joint; a power of two."""
+ROUNDING = 1e-5
+"""Upper bound on the rounding error of a distance [m]."""
+
+
+def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float) -> LinkPairTable:
+    """Table over the one or two joints between two links that tells where their convex parts are apart.
+
+    Boxes of joint values are not split further if the links move by less than `finest` [m] relative to each
+    other from the center of the box to any of its points. The cells of such a box count as colliding unless
+    they are proven free.
+    """
+    joints = robot.joints_between(*pair)
+    far = max(pair, key=robot.link_frame)
+    lever = radii_of(robot, [far])[0, list(joints)]
+    slides = np.array(robot.prismatic)[list(joints)]
+    lower = robot.lower[list(joints)]
+    upper = robot.upper[list(joints)]
+    upper = np.where(slides, upper, np.minimum(upper, lower + TURN))
+    columns = [[j.name for j in links.joints].index(robot.joint_names[joint]) for joint in joints]
+    nominal = links.named({})
+    edge = (upper - lower) / CELLS
+    # Boxes of joint values, in units of the table's cells. All boxes have the same `size`, which is halved
+    # along one joint per iteration. Each row of `low` is the lower corner of a box, and the column of `parts`
+    # with the same index is a pair of parts that may touch in the box.
+    separated = np.ones((CELLS,) * len(joints), dtype=bool)
+    size = np.full(len(joints), float(CELLS))
+    parts = np.indices([len(robot.meshes[link]) for link in pair]).reshape(2, -1)
+    low = np.zeros((parts.shape[1], len(joints)))
+    while len(low):
+        boxes, box_of_row = np.unique(low, axis=0, return_inverse=True)
+        q = np.tile(nominal, (len(boxes), 1))
+        q[:, columns] = lower + edge * (boxes + size / 2)
+        travel = float(lever @ (edge * size) / 2) + ROUNDING
+        distance = links.part_distances(links.poses(q, pair), *pair, box_of_row.ravel(), parts, travel)
+        touch = distance <= travel
+        # boxes that count as colliding: a cell, or a part of one, with a collision at its center; a box with
+        # a collision deeper than its motion; and a box with very little motion
+        given_up = touch & ((size <= 1).all() & (distance <= 0) | (distance < -travel) | (travel < finest))
+        for first, last in zip(*_cells(np.unique(low[given_up], axis=0), size), strict=True):
+            separated[tuple(slice(*ends) for ends in zip(first, last, strict=True))] = False
+        axis = int((lever * edge * size).argmax())
+        size = size.copy()
+        size[axis] /= 2
+        low = low[touch & ~given_up]
+        parts = parts[:, touch & ~given_up]
+        low = np.concatenate([low, low + size * (np.arange(len(size)) == axis)])
+        parts = np.tile(parts, 2)
+        if (size <= 1).all():  # a cell with one contact is decided: drop its other pairs
+            is_open = separated[tuple(_cells(low, size)[0].T)]
+            low = low[is_open]
+            parts = parts[:, is_open]
+    names = tuple(robot.joint_names[joint] for joint in joints)
+    return LinkPairTable(pair, names, tuple(lower.tolist()), tuple(upper.tolist()), separated)
+
+
+def _cells(low: Float[ndarray, "n joints"], size: Float[ndarray, "joints"]) -> tuple[ndarray, ndarray]:
+    """Along each joint, the index of the first cell that boxes overlap, and one past the last."""
+    return np.floor(low).astype(int), np.ceil(low + size).astype(int)
+
 
 ADJACENT_SHARE = 0.1
 """Adjacent links, which may touch in any case, are tested in only this fraction of the samples."""
@@ -61,7 +282,8 @@ class PairReport(NamedTuple):
     links: tuple[str, str]
     reason: str
     """checked, or why the pair is allowed: adjacent, always, never, default, pose or limits, as explained in
-    `find_allowed_collisions`; named, if it was named when the robot was added; srdf, if an SRDF allows it."""
+    `find_allowed_collisions`; named, if it was named when the robot was added; srdf, if an SRDF or a MuJoCo
+    model allows it."""
     colliding: float
     """Fraction of the tested configurations in which convex parts of the two links collide."""
 
@@ -85,7 +307,7 @@ def find_allowed_collisions(
       does not change.
     - limits: the links collide in at least a fifth of the samples. The value of one joint between the links
       determines whether they collide, and they collide at a stop of this joint: joints often have their stops
-      where the links on both sides meet.
+      where the links on both sides meet. Both links must belong to the arm, not behind a locked joint.
     - pose: the links overlap slightly in a named pose of the SRDF, such as a tucked one.
 
     Coal tests the convex parts unless the covering spheres show that they are apart. For pairs without
@@ -172,9 +394,8 @@ def _own_between(robot: Robot, a: str, b: str, max_locked: int) -> list[Joint] |
         count as tools."""
         planned = [joint for joint in above[link] if joint in robot.planned_joints][:1]
         carried = above[link][: above[link].index(planned[0])] if planned else above[link]
-        moving = [joint for joint in carried if joint.kind in MOVING_KINDS]
         tool = robot.at_end(link) and above[link][:1] != planned
-        return not tool and len(moving) <= max_locked
+        return not tool and sum(joint.kind in MOVING_KINDS for joint in carried) <= max_locked
 
     above = {link: robot.joints_above(link)[::-1] for link in (a, b)}
     if not own(a) or not own(b):
@@ -201,8 +422,9 @@ MAX_SPHERE_CASES = 2000
 MAX_PART_CASES = 60
 """Largest number of false collisions of convex parts per pair of links that are examined."""
 NARROWEST_FRACTION = 0.003
-"""For each pair, the false collisions of spheres where the convex parts are nearest, up to this fraction of
-the configurations, are left out of `PairFalseCollisions.places`: spheres need not become finer there."""
+"""`PairFalseCollisions.places` leaves out those false collisions of spheres with the narrowest gaps between
+the convex parts, since spheres need not become finer there. For each pair, they are at most this fraction of
+all configurations."""
 
 
 class PairFalseCollisions(NamedTuple):
@@ -349,6 +571,5 @@ def _sticking_out(
 def _narrowest_per_cube(points: Points, gaps: Values) -> Spheres:
     """The place with the narrowest gap in each cube of edge PLACE_SPACING, as rows of the point and its gap
     [m]."""
-    order = np.argsort(gaps)
-    rows = np.column_stack([points, gaps])[order]
+    rows = np.column_stack([points, gaps])[np.argsort(gaps)]
     return rows[one_per_cube(rows[:, :3], PLACE_SPACING)]

@@ -56,8 +56,8 @@ MIN_DEPTH = 5e-4
 FLOOR_TOLERANCE = 0.0015
 """Spheres may always stick out this far towards the floor [m], since a link may lie on it."""
 TOLERANCE_LEVEL = np.log(1.3)
-"""Tight places are grouped by tolerance for speed: within a group, tolerances differ by at most this factor
-(as a logarithm), and the lowest of them applies to the whole group."""
+"""Tight places with similar tolerances form a group, which saves time: the tolerances of a group differ by at
+most a factor of 1.3 (here its logarithm), and the lowest one applies to all of its places."""
 
 Planes = tuple[Points, Values, ndarray]
 
@@ -73,7 +73,8 @@ class Bounds(NamedTuple):
     """Tight places: rows of x, y, z and how far spheres may stick out there [m]. Near these places, `hidden`
     does not apply."""
     floor: tuple[Vector, float] | None = None
-    """Upward normal n and offset of a plane: spheres may not contain points x with n . x below the offset."""
+    """Upward normal n and offset [m] of a plane: spheres may not contain points x with n . x below the
+    offset. At heights above it of less than `tolerance`, `hidden` does not apply."""
 
     @property
     def varies(self) -> bool:
@@ -111,7 +112,8 @@ class SphereSizeGrid(NamedTuple):
 
 
 class Solid(NamedTuple):
-    """A union of convex meshes, with signed distances from its surface on a grid [m], negative inside."""
+    """A union of convex meshes, with signed distances from its surface on a grid [m], negative inside.
+    Outside, these are distances from face planes, which near edges are less than those from the solid."""
 
     meshes: tuple[ConvexMesh, ...]
     distance: Float[ndarray, "nx ny nz"]
@@ -149,8 +151,8 @@ class Solid(NamedTuple):
 
     @property
     def inside(self) -> Points:
-        """Grid points inside the solid. If the solid is so thin that there are none, the grid points nearest
-        to it."""
+        """Grid points inside the solid. If none is deeper than half the spacing, the grid points whose
+        distance is less than half the spacing above the lowest one."""
         distance = self.distance.ravel()
         return self.points[distance < max(0.0, float(distance.min()) + self.spacing / 2)]
 
@@ -169,8 +171,7 @@ class Solid(NamedTuple):
         beyond = distance - allowed
         if bounds.hidden is not None:
             queried = np.flatnonzero((beyond > 0) & (allowed >= bounds.tolerance))
-            hidden = queried[bounds.hidden(points[queried])]
-            beyond[hidden] = -self.spacing / 2
+            beyond[queried[bounds.hidden(points[queried])]] = -self.spacing / 2
         if bounds.floor is not None:
             normal, offset = bounds.floor
             beyond = np.maximum(beyond, offset - points @ normal)
@@ -204,7 +205,8 @@ def stacked_planes(meshes: tuple[ConvexMesh, ...]) -> Planes:
 
 
 def is_inside(points: Points, planes: Planes, depth: float) -> Mask:
-    """Which points are deeper than `depth` [m] in a part; a negative depth includes points near a part."""
+    """Which points are deeper than `depth` [m] in one of the meshes; a negative depth includes points near a
+    mesh."""
     return plane_depths(points, *planes, depth) > depth
 
 
@@ -217,16 +219,16 @@ def _grid_points(shape: tuple[int, ...] | ndarray, origin: Vector, spacing: floa
 MARGIN = 1e-5
 """Margin added to the radii [m], since files and single-precision kernels round them."""
 BURIED_DEPTH = 1e-9
-"""Points deeper than this in another part are not on the surface of the union [m]."""
+"""Points deeper than this in another mesh are not on the surface of the union [m]."""
 EXCESS_TOLERANCE = 0.1
 """Largest excess radius that is accepted, as a fraction of the grid spacing."""
 # Cells for choosing spheres, and for the final fit: number of cell edges per radius of the disc that a sphere
 # covers, and largest number of cells.
 COARSE_CELLS = (5.0, 60_000)
 FINE_CELLS = (8.0, 150_000)
-MAX_CROWD = 10
-"""If the surface would have more than this many times the allowed number of cells, larger cells are chosen
-at once, since the small cells may not fit into memory."""
+MAX_CELL_RATIO = 10
+"""If the estimated number of cells is more than this multiple of the allowed number, larger cells are chosen
+before any are made, since small ones may not fit into memory."""
 SMALLEST_TRIANGLE = 2e-6
 """A triangle of the surface that no single sphere contains is split down to this size [m]; a smaller one
 counts as uncovered."""
@@ -239,11 +241,11 @@ class SphereSettings:
     """How closely covering spheres follow the meshes of a link."""
 
     first_half: float = 0.015
-    """How far a sphere may stick out of a link whose frame has an index of at most half the number of planned
-    joints, rounded up [m]. In a serial arm, at most this many joints move such a link."""
+    """How far a sphere may stick out of a link in the first half of the arm [m]: the index of the link's
+    frame is at most half the number of planned joints, rounded up."""
     second_half: float = 0.009
-    """How far a sphere may stick out of a link on a later frame [m]. It is smaller because the outer links of
-    an arm work closer to obstacles."""
+    """How far a sphere may stick out of a link in the second half [m]. It is smaller because the outer links
+    of an arm work closer to obstacles."""
     fixed: float = 0.03
     """How far a sphere may stick out of a link that no planned joint moves [m]. It is larger because such a
     link is only checked against other links."""
@@ -262,8 +264,9 @@ class SphereSettings:
     def tolerance(self, frame: int, dof: int, inradius: float) -> float:
         """How far the spheres of a link may stick out [m].
 
-        The link is fixed to frame `frame` (see `Robot.link_frame`) of a robot with `dof` planned joints.
-        `inradius` [m] is the radius of the link's largest inscribed sphere.
+        The link is fixed to frame `frame` (see `Robot.link_frame`) of a robot with `dof` planned joints. The
+        result is at most `inradius`, the radius of the link's largest inscribed sphere [m], but at least
+        `finest`. For frame 0 it is the larger of `first_half` and `fixed`, within these bounds.
         """
         target = self.first_half if frame <= (dof + 1) // 2 else self.second_half
         if frame == 0:
@@ -300,21 +303,22 @@ def stick_out(solid: Solid, spheres: Spheres) -> Values:
 def covered(meshes: tuple[ConvexMesh, ...], spheres: Spheres) -> bool:
     """Whether the spheres provably cover the surface of the union of the meshes.
 
-    Triangles that no single sphere contains are cut in four, until all are contained, a corner outside all
-    spheres is found, or a triangle is smaller than SMALLEST_TRIANGLE.
+    Triangles that no single sphere contains are cut in four. This ends when spheres contain all triangles
+    (True), a corner is outside all spheres, or a triangle is smaller than SMALLEST_TRIANGLE (False).
+    Triangles and corners inside another mesh are ignored, since they are not on the surface.
     """
     triangles = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
     spheres = for_kernels(spheres)
-    single = [stacked_planes((mesh,)) for mesh in meshes] if len(meshes) > 1 else []
+    mesh_planes = [stacked_planes((mesh,)) for mesh in meshes] if len(meshes) > 1 else []
     while len(triangles):
         corners = triangles.reshape(-1, 3)
-        contained, bare = held_by_one(triangles, spheres)
+        contained, outside = held_by_one(triangles, spheres)
         is_open = ~contained
-        for planes in single:
+        for planes in mesh_planes:
             hidden = is_inside(corners, planes, BURIED_DEPTH)
             is_open &= ~hidden.reshape(-1, 3).all(1)
-            bare &= ~hidden
-        if bare.any():
+            outside &= ~hidden
+        if outside.any():
             return False
         triangles = triangles[is_open]
         if len(triangles) and np.linalg.norm(np.ptp(triangles, axis=1), axis=1).min() < SMALLEST_TRIANGLE:
@@ -335,29 +339,30 @@ class Cells(NamedTuple):
     corners: Int[ndarray, "c 3"]
     """Indices in `points` of the corners of each cell."""
     sharp: Mask
-    """Whether a point is a vertex of a mesh. Every other point lies on a face or an edge between neighboring
-    points, so a sphere that covers the neighbors covers the point."""
+    """Whether a point is a vertex of a mesh; true for all points if cells were left out or differ in size.
+    Every other point lies on a face or an edge between neighboring points, so a sphere that covers the
+    neighbors covers the point."""
 
     @staticmethod
     def of(solid: Solid, bounds: Bounds, cut: float, most: int) -> "Cells":
         """Cells on the surface of a solid. Triangles of a mesh that are inside another mesh are left out.
 
-        A sphere within the bounds covers a disc of a flat face. Edges of cells are at most 1 / `cut` of the
-        radius of the largest such disc, but longer if there would be more than `most` cells.
+        A sphere within the bounds covers a disc of a flat face. The radius of the largest such disc is at
+        least `cut` times the edge of a cell. If this makes more than `most` cells, the cells are larger, up
+        to the triangles of the meshes.
         """
         size = _disc(bounds.tolerance, solid.depth) / cut
         corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in solid.meshes])
         area = np.linalg.norm(np.cross(*np.diff(corners, axis=1).swapaxes(0, 1)), axis=1).sum() / 2
-        crowd = area / size**2 / most
-        if crowd > MAX_CROWD:
-            return Cells.of(solid, bounds, cut / np.sqrt(crowd), most)
+        ratio = area / size**2 / most
+        if ratio > MAX_CELL_RATIO:
+            return Cells.of(solid, bounds, cut / np.sqrt(ratio), most)
         soup = []
         vertices = []
         irregular = False
         planes = [stacked_planes((mesh,)) for mesh in solid.meshes]
         for k, mesh in enumerate(solid.meshes):
-            triangles = mesh.vertices[mesh.faces]
-            triangles = split(triangles, size)
+            triangles = split(mesh.vertices[mesh.faces], size)
             hidden = np.zeros(len(triangles), dtype=bool)
             for mesh_planes in (*planes[:k], *planes[k + 1 :]):
                 hidden |= is_inside(triangles.reshape(-1, 3), mesh_planes, BURIED_DEPTH).reshape(-1, 3).all(1)
@@ -369,9 +374,10 @@ class Cells(NamedTuple):
             vertices.append(mesh.vertices)
             irregular |= bool(hidden.any() or bounds.varies)
         corners = np.concatenate(soup).reshape(-1, 3)
-        crowd = len(corners) / 3 / most
-        if crowd > 1:
-            return Cells.of(solid, bounds, cut / np.sqrt(1.1 * crowd), most)
+        ratio = len(corners) / 3 / most
+        if ratio > 1 and len(corners) > 3 * sum(len(mesh.faces) for mesh in solid.meshes):
+            return Cells.of(solid, bounds, cut / np.sqrt(1.1 * ratio), most)
+        # join corners that agree to about a millionth of the size: round them to 21 bits for each axis
         points = np.concatenate([*vertices, corners])
         lattice = np.round((points - points.min(0)) * (2**20 / np.ptp(points, axis=0).max())).astype(np.int64)
         _, first, index = np.unique(lattice @ (1, 2**21, 2**42), return_index=True, return_inverse=True)
@@ -391,8 +397,8 @@ class Cells(NamedTuple):
         return assign(self.points, self.corners, centers, sizes.at(centers))
 
     def part(self, mine: Mask) -> "Cells":
-        """The cells in the mask `mine`. Points on the border to other cells count as sharp, since their
-        neighbors on one side of the border do not imply that they are covered."""
+        """The cells in the mask `mine`. Points that other cells share count as sharp, since some of their
+        neighbors are missing in the part."""
         outside = np.zeros(len(self.points), dtype=bool)
         outside[self.corners[~mine]] = True
         used, index = np.unique(self.corners[mine], return_inverse=True)
@@ -450,10 +456,10 @@ def _thin_out(sizes: SphereSizeGrid, cells: Cells, centers: Points, settings: Sp
         moved = np.zeros_like(required)
         failures = 0
         for i in np.argsort(loss):
-            takers = np.unique(runner_up[owner == i])
+            takers = np.unique(runner_up[owner == i])  # the spheres that would cover the cells of sphere i
             if required[i] or moved[i] or moved[takers].any():
                 continue
-            if not len(takers):
+            if not len(takers):  # sphere i has no cells
                 dropped[i] = True
                 continue
             affected = np.zeros(len(centers), dtype=bool)
@@ -492,7 +498,8 @@ def _without_holes(solid: Solid, inside: Points, spheres: Spheres) -> Spheres:
     could hide."""
     depth = solid.inscribed_sizes().at(inside)
     gap = gaps(inside, spheres)
-    # every point is within half a cube's diagonal of a grid point
+    # Every point is within `half`, half the diagonal of a grid cell, of a grid point. So deep in the solid, a
+    # sphere must contain the ball of this radius around the grid point; elsewhere, just the grid point.
     half = np.sqrt(0.75) * solid.spacing
     is_open = gap > np.where(depth > 2 * half, -half, 0.0)
     inside = inside[is_open]

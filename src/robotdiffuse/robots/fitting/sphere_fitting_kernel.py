@@ -12,7 +12,8 @@ import numpy as np
 from robotdiffuse.core.kernels import allocation_free, kernel
 from robotdiffuse.robots.frame_kernel import ball_gap, column, dot, length, minus, placed, rotated_back
 
-# initial step of the search for a center [m]: in round 1; lower bound in later rounds; factor per round
+# Initial step of the search for a center [m]: INITIAL_STEP in round 1; in each later round, STEP_SHRINKAGE
+# times the one before, but at least MIN_INITIAL_STEP.
 INITIAL_STEP = 0.004
 MIN_INITIAL_STEP = 0.0005
 STEP_SHRINKAGE = 0.8
@@ -235,7 +236,7 @@ def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
 
 @kernel(fastmath=True)
 def gaps(points, spheres):
-    """Signed distance of points from a union of spheres [m]; inside the union, only a bound."""
+    """Signed distance of points from a union of spheres [m]; inside the union, only an upper bound."""
     out = np.empty(len(points))
     for n in range(len(points)):
         gap = 1e9
@@ -253,7 +254,7 @@ def held_by_one(triangles, spheres):
     """Whether each triangle [t] is contained in a single sphere, and whether each corner [3 t] is outside all
     spheres."""
     contained = np.zeros(len(triangles), np.bool_)
-    bare = np.ones(3 * len(triangles), np.bool_)
+    outside = np.ones(3 * len(triangles), np.bool_)
     for t in range(len(triangles)):
         for i in range(len(spheres)):
             inside = 0
@@ -262,13 +263,13 @@ def held_by_one(triangles, spheres):
                 d = minus(triangles[t, k], spheres[i])
                 if dot(d, d) <= square:
                     inside += 1
-                    bare[3 * t + k] = False
+                    outside[3 * t + k] = False
             if inside == 3:
                 contained[t] = True
                 break
         if contained[t]:
-            bare[3 * t : 3 * t + 3] = False
-    return contained, bare
+            outside[3 * t : 3 * t + 3] = False
+    return contained, outside
 
 
 @allocation_free(fastmath=True)

@@ -1,12 +1,13 @@
 """Reads robots from MuJoCo models (MJCF). MuJoCo compiles the model, which is then written as a URDF with
 mesh files.
 
-Each body and each site of the model becomes a link with the body's or site's frame. Joint values are MuJoCo's
-`qpos`.
+Each body of the robot (see `robot_bodies`), and each site on one, becomes a link with the body's or site's
+frame. Joint values are MuJoCo's `qpos`.
 """
 
 import warnings
 import xml.etree.ElementTree as ET
+from contextlib import suppress
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,10 +15,10 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.errors import MAX_WORD, InputError, needs, shortened
+from robotdiffuse.core.errors import MAX_WORD, InputError, needs, shortened, shown
 from robotdiffuse.core.transforms import (
     inverse,
     quaternion_from_rotation,
@@ -25,7 +26,7 @@ from robotdiffuse.core.transforms import (
     rotation_from_quaternion,
     transform,
 )
-from robotdiffuse.core.types import Pose, Values, Vector
+from robotdiffuse.core.types import Mask, Pose, Values, Vector
 from robotdiffuse.robots.fitting.convex_parts import convex_hull
 from robotdiffuse.robots.parsing.srdf import Srdf
 
@@ -69,7 +70,7 @@ def compiled_model(path: Path) -> Any:
         mujoco.set_mju_user_warning(handler)
 
 
-def colliding_geoms(model: Any) -> Bool[ndarray, "_"]:
+def colliding_geoms(model: Any) -> Mask:
     """Whether each geom collides with anything: by its masks, or in a pair that the model names."""
     colliding = (model.geom_contype | model.geom_conaffinity) > 0
     colliding[[*model.pair_geom1, *model.pair_geom2]] = True
@@ -117,8 +118,9 @@ class ConvertedModel:
     """The robot of an MJCF file as a URDF whose root link is the world."""
 
     def __init__(self, path: Path) -> None:
-        """Raises InputError for a model without hinge or slide joints, for ball joints, for colliding
-        geoms of types that are not converted, and if all joints are slide joints without a range."""
+        """Raises InputError as `compiled_model` does, for a model without hinge or slide joints, for ball
+        joints, for colliding geoms of types that are not converted, for keyframes with values that are not
+        finite, and if all joints are slide joints without a range."""
         self.path = path
         self.model = model = compiled_model(path)
         self.folder = TemporaryDirectory(prefix="robotdiffuse-mjcf-")
@@ -149,8 +151,13 @@ class ConvertedModel:
         self.urdf = ET.tostring(self.root)
 
     def name(self, kind: str, index: int) -> str:
-        """The name of an element of the model; if it has none, its kind and index, such as "geom3"."""
-        return getattr(self.model, kind)(index).name or f"{kind}{index}"
+        """The name of an element of the model; if it has none, its kind and index, such as "geom3", with an
+        underscore if another element has this name."""
+        named = getattr(self.model, kind)
+        label = named(index).name or f"{kind}{index}"
+        with suppress(KeyError):
+            return f"{label}_" if named(label).id != index else label
+        return label
 
     def joint_name(self, joint: int) -> str:
         return self.name("joint", joint)
@@ -227,8 +234,8 @@ class ConvertedModel:
             ET.SubElement(element, "mimic", self.mimics[joint])
 
     def _effort(self, joint: int) -> float:
-        """The largest force or torque that actuators may apply to a joint [N] or [N m]; 0 if it has no
-        limit."""
+        """The joint's own limit of the force or torque of its actuators, else the largest limit of one of
+        them [N] or [N m]; 0 if there is none."""
         model = self.model
         if model.jnt_actfrclimited[joint]:
             return float(np.abs(model.jnt_actfrcrange[joint]).max())
@@ -237,7 +244,7 @@ class ConvertedModel:
                 float(np.abs(model.actuator_forcerange[k]).max() * abs(model.actuator_gear[k, 0]))
                 for k in range(model.nu)
                 if model.actuator_trnid[k, 0] == joint
-                and kind_of("Trn", model.actuator_trntype[k]) == "joint"
+                and kind_of("Trn", model.actuator_trntype[k]) in ("joint", "jointinparent")
                 and model.actuator_forcelimited[k]
             ),
             default=0.0,
@@ -251,6 +258,7 @@ class ConvertedModel:
             if model.tendon_limited[k]
         ]
         mimics: dict[int, dict[str, str]] = {}
+        movable = {*_joints_of(model, self.bodies)} - self.held
         for k in range(model.neq):
             if not model.eq_active0[k]:
                 continue
@@ -258,12 +266,12 @@ class ConvertedModel:
             leader = int(model.eq_obj2id[k])
             offset, slope, *higher = model.eq_data[k, :5].tolist()
             kind = kind_of("Eq", model.eq_type[k])
-            if kind != "joint" or leader < 0 or any(higher):
+            if kind == "joint" and follower not in movable:
+                continue
+            if kind != "joint" or leader not in movable or any(higher):
                 self.notes.append(
                     f"equality {self.name('equality', k)} ({kind}) is ignored; hold what it ties by --lock"
                 )
-                continue
-            if leader in self.held:
                 continue
             start = model.qpos0[model.jnt_qposadr[[follower, leader]]]
             mimics[follower] = {
@@ -275,7 +283,7 @@ class ConvertedModel:
 
     def _geometry(self, link: ET.Element, body: int) -> None:
         """Adds the inertia and the geoms of a body to its link. Geoms that collide with nothing become visual
-        elements."""
+        elements, or are left out if their type is not converted."""
         model = self.model
         if model.body_mass[body] > 0:
             inertial = ET.SubElement(link, "inertial")
@@ -340,8 +348,8 @@ class ConvertedModel:
 
     def _excluded(self) -> dict[frozenset[str], str]:
         """Pairs of links that MuJoCo does not check for collision: excluded pairs, rigidly connected links, a
-        link and the link that carries it, and links between which the masks of all geoms exclude
-        collision; but not links with geoms that the model names as a pair."""
+        link and the link that carries it (unless the model disables filterparent), and links whose geoms all
+        exclude each other by their masks. Links with geoms that the model names as a pair are checked."""
         model = self.model
         excluded, named = (
             {frozenset(divmod(int(signature), 2**16)) for signature in signatures}
@@ -371,8 +379,10 @@ class ConvertedModel:
 
     def _poses(self) -> dict[str, dict[str, float]]:
         model = self.model
-        if not np.isfinite(model.key_qpos).all():
-            raise InputError(f"{self.path}: a value in qpos of a keyframe is no finite number")
+        for k, qpos in enumerate(model.key_qpos):
+            if not np.isfinite(qpos).all():
+                name = f"qpos of keyframe {self.name('key', k)}"
+                raise InputError(f"{self.path}: {name} is {shown(qpos)}; its numbers must be finite")
         places = {
             self.joint_name(joint): model.jnt_qposadr[joint]
             for joint in _joints_of(model, self.bodies)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from urllib.parse import unquote
 
 from robotdiffuse.core.errors import MAX_WORD, InputError, shortened, shown
-from robotdiffuse.core.input_files import is_file
+from robotdiffuse.core.files import is_file
 
 MAX_PACKAGES = 32
 """Largest number of attempts to compile a xacro file. Each attempt knows one more package, which was looked
@@ -95,7 +95,9 @@ def with_prefixes(text: bytes) -> bytes:
     used = {prefix for pair in NAMESPACE_PREFIX.findall(text) for prefix in pair if prefix}
     missing = sorted(name for name in used - {b"xml", b"xmlns"} if b"xmlns:" + name not in text)
     declared = b"".join(b' xmlns:%s="%s"' % (name, name) for name in missing)
-    return text.replace(b"<robot", b"<robot" + declared, 1) if missing else text
+    # comments before the root may contain "<robot", too
+    pattern = re.compile(rb"(<!--.*?-->)|<robot", re.DOTALL)
+    return pattern.sub(lambda m: m[0] if m[1] else m[0] + declared, text) if missing else text
 
 
 def compiled_xacro(path: Path, packages: Packages) -> bytes:

@@ -7,13 +7,14 @@ Format: https://docs.ros.org/en/noetic/api/srdfdom/html/ and MoveIt's "URDF and 
 import math
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from os.path import commonprefix
 from pathlib import Path
 from typing import NamedTuple
 
 from robotdiffuse.core.errors import MAX_COORDINATE, InputError, check_name, repeated, shown, unknown_name
-from robotdiffuse.core.input_files import is_file, parse_xml, read_bytes
+from robotdiffuse.core.files import is_file, parse_xml, read_bytes
 from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, Joint, chain
 from robotdiffuse.robots.robot import Robot
 
@@ -43,11 +44,21 @@ class Srdf:
     allowed: dict[frozenset[str], str] = field(default_factory=dict)
     """Pairs of links that are not checked against each other, with the reason that the SRDF gives, such as
     Adjacent or Never."""
+    unchecked: frozenset[str] = frozenset()
+    """Links of <disable_default_collisions>: they are only checked against the links that `enabled` names."""
+    enabled: frozenset[frozenset[str]] = frozenset()
+    """Pairs of links of <enable_collisions>."""
     groups: dict[str, "Group"] = field(default_factory=dict)
     poses: dict[str, dict[str, float]] = field(default_factory=dict)
-    """Named poses: values by joint [rad] or [m]. States of several groups with the same name are merged."""
+    """Named poses: values by joint [rad] or [m]. States with the same name, of several groups, are merged."""
     passive: frozenset[str] = frozenset()
     """Names of joints without an actuator."""
+
+    def allowed_among(self, links: Collection[str]) -> dict[frozenset[str], str]:
+        """`allowed`, and the pairs of these links that are not checked by default."""
+        pairs = {frozenset((link, other)) for link in self.unchecked.intersection(links) for other in links}
+        by_default = {pair: "Default" for pair in pairs - self.enabled if len(pair) > 1}
+        return by_default | self.allowed
 
     def joints(self, group: str, joints: tuple[Joint, ...]) -> list[Joint]:
         """The movable joints of a group and of its subgroups, parents before children.
@@ -140,6 +151,7 @@ def read_srdf(file: str | Path) -> Srdf:
             )
         return value
 
+    virtual = names(root, "virtual_joint")  # they connect the root to the world
     poses: dict[str, dict[str, float]] = {}
     for state in root.findall("group_state"):
         values = {text(joint, "name"): number(joint) for joint in state.findall("joint")}
@@ -150,9 +162,14 @@ def read_srdf(file: str | Path) -> Srdf:
             frozenset((text(pair, "link1"), text(pair, "link2"))): pair.get("reason", "")
             for pair in root.findall("disable_collisions")
         },
+        unchecked=frozenset(text(link, "link") for link in root.findall("disable_default_collisions")),
+        enabled=frozenset(
+            frozenset((text(pair, "link1"), text(pair, "link2")))
+            for pair in root.findall("enable_collisions")
+        ),
         groups={
             text(group, "name"): Group(
-                joints=names(group, "joint"),
+                joints=tuple(name for name in names(group, "joint") if name not in virtual),
                 links=names(group, "link"),
                 chains=tuple(
                     (text(chain, "base_link"), text(chain, "tip_link")) for chain in group.findall("chain")
@@ -177,6 +194,9 @@ ALL = "all"
 FINGER = re.compile("finger|fngr|jaw|claw|knuckle|thumb", re.IGNORECASE)
 """Matches names of fingers. If the last joint of an arm moves a link with such a name, and at least
 MIN_ARM_JOINTS own joints come before this joint, it counts as a gripper joint under any name."""
+NO_TIP = re.compile("camera|optical|sensor|finger|_sc$", re.IGNORECASE)
+"""Matches names of links that become the tip only if no other kind of link has the same parent: sensors,
+fixed fingers, and Franka's coarse collision geometry (`fr3_link7_sc`)."""
 SUFFIX_CHARACTERS = "_-/0123456789 "
 """Characters stripped from the end of the common prefix of an arm's joint names."""
 MAX_FINGER_JOINTS = 2
@@ -184,9 +204,10 @@ MAX_FINGER_JOINTS = 2
 MAX_HAND_FINGER_JOINTS = 3
 """Largest number of independent joints per finger of a gripper with another number of fingers."""
 MIN_ARM_JOINTS = 4
-"""Chains with fewer own joints (see `Arm.own_joints`) count as arms only if no chain has as many. Three or
-more branches after this many own joints form a hand, with any number of joints per finger, unless one or two
-of them have at least LIMB_JOINTS joints: these are arms, on a torso that may carry a head too."""
+"""Chains with fewer own joints (see `Arm.own_joints`) count as arms only if no chain has this many. Three or
+more branches after at least this many own joints form a hand, with any number of joints per finger. But if
+one or two of these branches have at least LIMB_JOINTS joints, these are arms on a torso, and the rest may be
+a head."""
 LIMB_JOINTS = 6
 """Smallest number of independent joints of arms on a torso."""
 
@@ -231,8 +252,7 @@ class JointTree:
 
     def _chain_length(self, joint: Joint) -> int:
         """Largest number of independent movable joints in a chain that begins with a joint."""
-        drives = joint.kind in MOVING_KINDS and joint.mimic is None
-        return self.moving.get(joint.child, 0) + drives
+        return self.moving.get(joint.child, 0) + (joint.kind in MOVING_KINDS and joint.mimic is None)
 
     def arms(self) -> list[Arm]:
         """The chains below the base with at least MIN_ARM_JOINTS own joints; if there are none, the longest
@@ -279,9 +299,13 @@ class JointTree:
         return len(branches) > 2 and (max(lengths) <= MAX_HAND_FINGER_JOINTS or hand)
 
     def _deepest(self, link: str) -> str:
-        """The deepest link below a link."""
+        """The link at the end of the deepest branches below a link. A branch whose first link matches
+        `NO_TIP` is followed only if there is no other."""
         while self.below.get(link):
-            link = max(self.below[link], key=lambda joint: self._depth.get(joint.child, 0)).child
+            link = max(
+                self.below[link],
+                key=lambda joint: (not NO_TIP.search(joint.child), self._depth.get(joint.child, 0)),
+            ).child
         return link
 
 
@@ -334,14 +358,19 @@ def _ends(chosen: list[str], above: dict[str, Joint], written: list[str]) -> lis
 
 
 def linkage_notes(file: Path, robot: Robot) -> list[str]:
-    """Notes on joints that mimic planned joints: planning holds these mimic joints. Raises InputError if one
-    of them moves geometry or a tip."""
+    """Notes on joints that are held although they mimic planned joints or joints above the base. Raises
+    InputError if a joint that mimics a planned joint moves geometry or a tip."""
     by_name = {joint.name: joint for joint in robot.joints}
     notes = []
     for joint in robot.joints:
         leader = joint
         while leader.mimic and leader.mimic.joint in by_name:
             leader = by_name[leader.mimic.joint]
+        if leader.mimic:
+            notes.append(
+                f"joint {leader.name} mimics {leader.mimic.joint}, which is above the base: it is held at "
+                f"{robot.locked[leader.name]:g}; --lock {leader.name}=VALUE sets another value"
+            )
         if leader is joint or leader.name in robot.locked:
             continue
         what = f"joint {joint.name} mimics {leader.name}, which is planned; that is not supported: "

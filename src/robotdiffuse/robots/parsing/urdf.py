@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -28,7 +29,7 @@ from robotdiffuse.core.errors import (
     unit_quaternion,
     within,
 )
-from robotdiffuse.core.input_files import parse_xml, read_bytes, read_yaml
+from robotdiffuse.core.files import parse_xml, read_bytes, read_yaml
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import (
     inverse,
@@ -67,8 +68,6 @@ def moves_in_a_plane(joints: Sequence[Joint]) -> bool:
 
 
 PRIMITIVES = ("box", "capsule", "cylinder", "sphere")
-
-
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 KINDS = (*MOVING_KINDS, "fixed")
 SINGLE = ("origin", "geometry", "parent", "child", "axis", "limit", "mimic", "inertial")
@@ -81,8 +80,10 @@ MAX_SIZE_PER_REACH = 10.0
 """A moving link above MAX_LINK_SIZE is refused if it is larger than the arm's reach by this factor."""
 DEFAULT_VELOCITY = 1.0
 """Velocity limit of movable joints for which the URDF gives none [rad/s] or [m/s]."""
+RATE_LIMITS = ("velocity", "acceleration", "deceleration", "jerk")
+"""Attributes of <limit> that are read if they are positive; few URDFs have more than velocity."""
 ACCELERATION_PER_VELOCITY = 4.0
-"""Ratio of acceleration and velocity limits [1/s], since URDF has no acceleration limit: full speed is
+"""Ratio of acceleration and velocity limits [1/s], for URDFs without acceleration limits: full speed is
 reached after 0.25 s."""
 JERK_PER_ACCELERATION = 10.0
 """Ratio of jerk and acceleration limits [1/s]: full acceleration is reached after 0.1 s."""
@@ -103,7 +104,8 @@ class UrdfTree:
     unlimited: set[str] = field(default_factory=set)
     """Joints without a velocity limit."""
     unranged: set[str] = field(default_factory=set)
-    """Joints without limits of position, such as wheels; they can be held at 0, but not planned."""
+    """Joints without limits of position, such as wheels; they are planned only if `limits` of `robot` gives
+    position limits, and can be held at any value."""
     text: bytes = field(init=False)
     """The URDF, also of a xacro file or a MuJoCo model."""
     _surfaces: dict[str, tuple[Surface, ...]] = field(default_factory=dict)
@@ -169,14 +171,18 @@ class UrdfTree:
             self.parents[child] = name
             self.children.setdefault(parent, []).append(name)
         roots = [link for link in self.links if link not in self.parents]
+        reached = [*roots]
+        for link in reached:  # the list grows while it is read
+            reached += [self.ends[name][1] for name in self.children.get(link, ())]
+        looped = sorted(self.links.keys() - reached)
+        if looped:
+            raise InputError(f"{self.path}: the joints of {joined(looped)} form a loop; remove one")
         if len(roots) != 1:
             raise InputError(
                 f"{self.path}: a URDF must have one root link; this one has {len(roots)}"
                 + (
                     f" ({', '.join(roots[:5])}); connect them with fixed joints"
                     if roots
-                    else ": the joints form a loop; remove one"
-                    if self.links
                     else ": it has no links; if it only defines macros, add a xacro file that uses them"
                 )
             )
@@ -194,11 +200,12 @@ class UrdfTree:
         """The robot, with convex collision meshes and without spheres.
 
         Planned joints are the movable joints of the group, or all movable joints from base to tip. Passive
-        joints and mimic joints are not planned, nor are joints with equal limits. All joints that are not
-        planned are locked: at the value in `locked`, else at their value in a rest pose of the SRDF or at
-        zero, clipped to their limits. Locked mimic joints follow the joints that they mimic.
+        joints and mimic joints are not planned, nor are joints with equal limits or with a value in `locked`.
+        All joints that are not planned are locked: at their value in `locked`, which is not clipped; else at
+        their value in a rest pose of the SRDF, or at zero, clipped to their limits. Locked mimic joints
+        follow the joints that they mimic.
 
-        Acceleration and jerk limits, which URDF lacks, are 4 s⁻¹ times the velocity limit and 10 s⁻¹ times
+        Acceleration and jerk limits that the file lacks are 4 s⁻¹ times the velocity limit and 10 s⁻¹ times
         the acceleration limit; `limits` may change them. Each collision element becomes a convex hull in
         the link's frame; cylinders, capsules and spheres become polyhedra around the shape. If no link has
         collision elements, visual elements are used, with a note.
@@ -217,7 +224,8 @@ class UrdfTree:
             limits: Limits that replace those of the file, see `with_limits`.
 
         Raises:
-            InputError: If the file or the arguments are incomplete or contradictory; it names the file.
+            InputError: If the file or the arguments are incomplete or contradictory; for mistakes in the
+                file, it names the file.
         """
         base = base or self.root
         srdf = srdf or Srdf(self.path)
@@ -226,13 +234,13 @@ class UrdfTree:
         names = [base, *(joint.child for joint in joints)]
         planned, ends = planned_joints(self.path, base, joints, tip, group, srdf)
         limits = limits or {}
-        unranged = sorted(planned & self.unranged.difference(limits, locked or {}))
+        ranged = {name for name, fields in limits.items() if {"lower", "upper"} & fields.keys()}
+        unranged = sorted(planned & self.unranged.difference(ranged, locked or {}))
         if unranged:
             raise InputError(
-                f"{self.path}: {joined(unranged)}: no <limit lower= upper=>; add it, or hold them with --lock"
+                f"{self.path}: {joined(unranged)}: no <limit lower= upper=>; add it, give position limits "
+                "with --limits, or hold them with --lock"
             )
-        meshes = self.geometry(names)
-        inertias = self.inertias(names)
         notes = [
             f"joint {joint.name} is passive; it is held" for joint in joints if joint.name in srdf.passive
         ]
@@ -249,17 +257,18 @@ class UrdfTree:
             tip=ends[0],
             other_tips=tuple(ends[1:]),
             joints=tuple(joints),
-            meshes={link: parts for link, parts in meshes.items() if parts},
+            meshes=self.geometry(names),
+            inertias=self.inertias(names),
             notes=tuple(dict.fromkeys((*self.notes, *notes))),
             root=self.pose_link(base),
             above=self.above(base),
             poses=dict(srdf.poses),
-            inertias=inertias,
         )
         robot = with_limits(robot, limits)
         movable = [joint for joint in robot.joints if joint.kind in MOVING_KINDS]
         fixed_joints = [joint.name for joint in movable if joint.lower == joint.upper]
-        resting = srdf.resting()
+        # a mimic joint has its offset if the joint that it mimics is above the base
+        resting = {joint.name: joint.mimic.offset for joint in movable if joint.mimic} | srdf.resting()
         rest = {
             joint.name: float(np.clip(resting.get(joint.name, 0.0), joint.lower, joint.upper))
             for joint in movable
@@ -298,8 +307,9 @@ class UrdfTree:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the URDF and of the mesh files of its collision geometry. For a xacro file or a MuJoCo
-        model, the URDF that was made from it is hashed, with excluded pairs and poses."""
+        """SHA-256 of the URDF and of the mesh files of its collision geometry. Of a xacro file or a MuJoCo
+        model, the URDF that was made from it is hashed; of a MuJoCo model, also its excluded pairs and
+        poses."""
         digest = hashlib.sha256(self.text)
         if self.semantics:
             allowed = sorted(map(sorted, self.semantics.allowed))
@@ -321,7 +331,8 @@ class UrdfTree:
         return hashlib.sha256(read_bytes(self.srdf, "SRDF")).hexdigest() if self.srdf else ""
 
     def _named(self, root: ET.Element, what: str) -> dict[str, ET.Element]:
-        """The links or joints by name."""
+        """The links or joints by name. Raises InputError for missing or repeated names, and for elements in
+        SINGLE that appear more than once."""
         elements: dict[str, ET.Element] = {}
         for element in root.findall(what):
             name = element.get("name")
@@ -398,17 +409,17 @@ class UrdfTree:
                 f"{self.path}: {location} has type {shown(kind)}; supported: {', '.join(KINDS)}; remove it "
                 f"with what it carries, or use --base {self.ends[name][1]} to plan only for what it carries"
             )
-        axis = np.array([1.0, 0.0, 0.0])
-        if kind != "fixed":
-            axis = self._numbers(_attributes(element, "axis").get("xyz", "1 0 0"), 3, f"{location}: axis")
-            if np.linalg.norm(axis) < 1e-6:
-                raise InputError(f"{self.path}: {location}: its axis is zero; give it a direction")
-            axis = axis / np.linalg.norm(axis)
-        joint = Joint(name, kind, *self.ends[name], self._origin(element, location), axis)
+        T_parent_joint = self._origin(element, location)
+        joint = Joint(name, kind, *self.ends[name], T_parent_joint, np.array([1.0, 0.0, 0.0]))
         if kind == "fixed":
             return joint
+        axis = self._numbers(_attributes(element, "axis").get("xyz", "1 0 0"), 3, f"{location}: axis")
+        if np.linalg.norm(axis) < 1e-6:
+            raise InputError(f"{self.path}: {location}: its axis is zero; give it a direction")
         hard = _attributes(element, "limit")
-        joint = self._with_limits(replace(joint, mimic=self._mimic(name, element)), hard)
+        joint = self._with_limits(
+            replace(joint, axis=axis / np.linalg.norm(axis), mimic=self._mimic(name, element)), hard
+        )
         soft = _attributes(element, "safety_controller")
         soft_limits = [
             f"{end} {soft[f'soft_{end}_limit']}"
@@ -437,20 +448,22 @@ class UrdfTree:
                 )
             leaders.append(joint)
             leader = self.elements[joint].find("mimic")
-        if self.elements[leaders[-1]].get("type") == "fixed":
-            self.notes.append(f"joint {name} mimics the fixed joint {leaders[-1]}; treated as independent")
+        if self.elements[leaders[1]].get("type") == "fixed":
+            self.notes.append(f"joint {name} mimics the fixed joint {leaders[1]}; treated as independent")
             return None
-        location = f"joint {name}: mimic"
-        multiplier = self._numbers(followed.get("multiplier", "1"), 1, f"{location} multiplier")
-        offset = self._numbers(followed.get("offset", "0"), 1, f"{location} offset")
-        return Mimic(leaders[1], float(multiplier[0]), float(offset[0]))
+        numbers = [
+            float(self._numbers(followed.get(field, default), 1, f"joint {name}: mimic {field}")[0])
+            for field, default in (("multiplier", "1"), ("offset", "0"))
+        ]
+        return Mimic(leaders[1], *numbers)
 
     def _with_limits(self, joint: Joint, attributes: dict[str, str]) -> Joint:
         stated = {name: text for name, text in attributes.items() if not _is_endless(text)}
+        # a position limit that stands for none voids the other one too
         ranged = joint.kind != "continuous" and {"lower", "upper"}.isdisjoint(attributes.keys() - stated)
         limits = {
             name: float(self._numbers(stated[name], 1, f"joint {joint.name}: {name} limit")[0])
-            for name in (("lower", "upper", "velocity") if ranged else ("velocity",))
+            for name in (("lower", "upper", *RATE_LIMITS) if ranged else RATE_LIMITS)
             if name in stated
         }
         if joint.kind == "continuous":
@@ -463,20 +476,25 @@ class UrdfTree:
             raise InputError(
                 f"{self.path}: joint {joint.name}: lower limit {lower} is above upper {upper}; exchange them"
             )
+        for name in RATE_LIMITS:
+            if 0 < limits.get(name, 0.0) < MIN_RATE:
+                raise InputError(
+                    f"{self.path}: joint {joint.name}: {name} limit is {limits[name]:g}; it must be at least "
+                    f"{MIN_RATE:g}, or 0 if there is none"
+                )
         velocity = limits.get("velocity", 0.0)
-        if 0 < velocity < MIN_RATE:
-            raise InputError(
-                f"{self.path}: joint {joint.name}: velocity limit is {velocity:g}; it must be at least "
-                f"{MIN_RATE:g}, or 0 if there is none"
-            )
         if velocity <= 0:
             velocity = DEFAULT_VELOCITY
             self.unlimited.add(joint.name)
         effort = 0.0
-        with suppress(InputError):  # only planning with a payload needs effort limits
-            effort = max(float(self._numbers(attributes.get("effort", ""), 1, "effort")[0]), 0.0)
-        joint = replace(joint, lower=lower, upper=upper, effort=effort)
-        return _changed(joint, {"velocity": velocity})
+        with suppress(ValueError):  # only planning with a payload needs effort limits
+            effort = float(attributes.get("effort", ""))
+        joint = replace(joint, lower=lower, upper=upper, effort=effort if 0 < effort <= MAX_RATE else 0.0)
+        rates = {name: limits[name] for name in RATE_LIMITS[1:] if limits.get(name, 0.0) > 0}
+        braking = rates.pop("deceleration", math.inf)
+        if braking < rates.get("acceleration", ACCELERATION_PER_VELOCITY * velocity):
+            rates["acceleration"] = braking
+        return _changed(joint, {"velocity": velocity} | rates)
 
     def inertias(self, links: list[str]) -> dict[str, Inertia]:
         """Inertias of the links that have a mass. Incomplete and physically impossible inertias are left out,
@@ -485,7 +503,8 @@ class UrdfTree:
         for link in links:
             element = self.links[link].find("inertial")
             mass = None if element is None else element.find("mass")
-            if element is None or mass is None or mass.get("value", "").strip() in ("0", "0.0"):
+            massless = mass is not None and re.fullmatch(r"0+\.?0*", mass.get("value", "").strip())
+            if element is None or mass is None or massless:
                 continue
             attributes = _attributes(element, "inertia")
             try:
@@ -499,23 +518,25 @@ class UrdfTree:
         return inertias
 
     def geometry(self, links: list[str]) -> dict[str, tuple[ConvexMesh, ...]]:
-        """Convex hulls of the links' collision elements, by link and in the link's frame.
+        """Convex hulls of the collision elements of each link that has some, in the link's frame.
 
         If no link of the file has collision elements, the hulls of the visual elements are returned.
         """
         parts = {
-            link: tuple(convex_hull(surface.vertices) for surface in self.surfaces(link)) for link in links
+            link: tuple(convex_hull(surface.vertices) for surface in surfaces)
+            for link in links
+            if (surfaces := self.surfaces(link))
         }
         self.notes += [
             f"link {link} has {self.kind} geometry without volume, made {1e3 * MIN_THICKNESS:g} mm thick"
             for link in links
             if any(len(thickened(part.vertices)) > len(part.vertices) for part in self.surfaces(link))
         ]
-        if self.kind == "visual" and any(parts.values()):
+        if self.kind == "visual" and parts:
             self.notes.append("no link has collision geometry; the visual geometry is used")
         else:
             without_collision = [
-                link for link in links if not parts[link] and self.links[link].find("visual") is not None
+                link for link in links if link not in parts and self.links[link].find("visual") is not None
             ]
             if without_collision:
                 self.notes.append(
@@ -524,9 +545,11 @@ class UrdfTree:
         return parts
 
     def surfaces(self, link: str) -> tuple[Surface, ...]:
-        """The link's collision elements as triangle meshes, in the link's frame.
+        """The link's elements of the tag `kind` as triangle meshes, in the link's frame.
 
-        Raises InputError for elements without geometry, unknown shapes and damaged meshes.
+        Shapes whose sizes are all 0, as of Jaco and Atlas, are left out, with a note. Raises InputError for
+        elements without exactly one shape, unknown shapes, wrong sizes, scales and origins, and meshes that
+        are missing or damaged.
         """
         if link in self._surfaces:
             return self._surfaces[link]
@@ -538,6 +561,9 @@ class UrdfTree:
                     f"{self.path}: link {link}: a <{self.kind}> has {len(shapes)} shapes; it must have one"
                 )
             shape = shapes[0]
+            if re.fullmatch("[ .]*0[ .0]*", " ".join(shape.attrib.values())):
+                self.notes.append(f"link {link}: a <{self.kind}> of size 0 is ignored")
+                continue
             if shape.tag == "mesh":
                 surface = self._mesh(shape, link)
             elif shape.tag in PRIMITIVES:
@@ -559,7 +585,9 @@ class UrdfTree:
             location = f"link {link}: {shape.tag} {name}"
             values = self._numbers(shape.get(name, ""), count, location)
             if (values < MIN_SIZE).any():
-                raise InputError(f"{self.path}: {location} is {shown(shape.get(name))}; it must be positive")
+                raise InputError(
+                    f"{self.path}: {location} is {shown(shape.get(name))}; it must be above 1e-9"
+                )
             return values
 
         if shape.tag == "box":
@@ -580,10 +608,10 @@ class UrdfTree:
         scale = self._numbers(shape.get("scale", "1 1 1"), 3, f"{location} scale")
         if (np.abs(scale) < MIN_SIZE).any():
             raise InputError(
-                f"{self.path}: {location} scale is {shown(shape.get('scale'))}; its numbers must not be 0"
+                f"{self.path}: {location} scale is {shown(shape.get('scale'))}; numbers must be beyond ±1e-9"
             )
         with located(self.path):
-            vertices, faces = read_triangles(file, merge=True, notes=self.notes)
+            vertices, faces = read_triangles(file, merge=True, notes=self.notes, turn=False)
             vertices = points(location, "vertices", vertices * scale)
         if len(vertices) < 4:
             raise InputError(
@@ -652,9 +680,11 @@ def read_limits(file: str | Path) -> tuple[dict[str, dict[str, float]], tuple[st
 
     The file has the form joint_limits: {JOINT: {max_velocity: 2.0}}, with the fields min_position,
     max_position, max_velocity, max_acceleration, max_jerk and max_effort. A field is ignored if MoveIt's flag
-    for it, such as has_velocity_limits, is false. Other entries beside joint_limits, such as MoveIt's default
-    scaling factors, are ignored, with a note. Raises InputError for a file without joint_limits, and for
-    unknown fields and wrong values.
+    for it, such as has_velocity_limits, is false. All other fields that begin with has_, and
+    angle_wraparound, are ignored without a note. Other entries beside joint_limits, such as MoveIt's default
+    scaling factors, are ignored, with a note. Raises InputError for a file that cannot be read or lacks
+    joint_limits, for an entry that is not a mapping, for max_deceleration and unknown fields, and for wrong
+    values.
     """
     data = read_yaml(file, "joint limits")
     joints = data.get("joint_limits") if isinstance(data, dict) else None
@@ -722,8 +752,9 @@ def _changed(joint: Joint, fields: dict[str, float]) -> Joint:
         fields = fields | {"jerk": JERK_PER_ACCELERATION * fields["acceleration"]}
     if joint.kind == "continuous" and {"lower", "upper"} & fields.keys():
         joint = replace(joint, kind="revolute", lower=-math.pi, upper=math.pi)
-    lower = fields.get("lower", joint.lower)
-    upper = fields.get("upper", joint.upper)
-    if lower > upper:
-        raise InputError(f"joint_limits of {joint.name}: min_position {lower} is above max_position {upper}")
-    return replace(joint, **fields)
+    joint = replace(joint, **fields)
+    if joint.lower > joint.upper:
+        raise InputError(
+            f"joint_limits of {joint.name}: min_position {joint.lower} is above max_position {joint.upper}"
+        )
+    return joint
