@@ -51,8 +51,7 @@ def test_what_is_proved_holds_at_every_sample_and_what_is_not_proved_does_not(co
     for _ in range(20):
         a, b = rng.uniform(PANDA.lower, PANDA.upper, (2, 7))
         q = np.stack([a, a + rng.uniform(0.05, 1) * (b - a)])
-        between = q[0] + np.linspace(0, 1, 4001)[:, None] * (q[1] - q[0])
-        sampled = ready.values(between)
+        sampled = ready.values(q[0] + np.linspace(0, 1, 4001)[:, None] * (q[1] - q[0]))
         most = sampled.max(axis=0)
         if (most > 3.1).any():  # a kink, which samples miss
             continue
@@ -162,8 +161,7 @@ def test_projection_onto_tolerances_of_goals_agrees_with_the_validator(seed: int
     satisfied = ready.satisfied(q)
     assert satisfied[0] and not (satisfied & ~at_goal).any()
     roomy = rd.PoseGoal(HAND, goal.T_base_frame, 1.01 * xyz + 1e-4, 1.01 * rpy + 1e-4)
-    roomy_rows = PathConstraints(rd.Problem(PANDA, rd.Scene(), START, roomy), [roomy])
-    assert not (at_goal & ~roomy_rows.satisfied(q)).any()
+    assert not (at_goal & ~PathConstraints(rd.Problem(PANDA, rd.Scene(), START, roomy), [roomy]).satisfied(q)).any()
     for row in ready.projected(q, 0.9):
         assert goal_error(PANDA, goal, row) is None
 

@@ -116,19 +116,14 @@ def test_blended_waypoints_are_passed_within_their_blend_without_a_stop(blend: f
     assert found is not None and found.message == "the motion does not stop at waypoints[0]"
 
 
-def test_each_waypoint_has_its_own_blend() -> None:
+def test_each_waypoint_has_its_own_blend_no_wider_than_is_free() -> None:
     problem = rd.Problem(ROBOT, rd.Scene([POST]), START, END, waypoints=[MIDDLE, START, MIDDLE], blend=[0, 0.1, 0])
     result = rd.plan(problem, time_limit=10.0)
     assert result.trajectory is not None and verify_trajectory(problem, result.trajectory).valid
     assert stops(result.trajectory, np.array(MIDDLE)) and "4 segments" in result.reason
-    moving = np.linalg.norm(result.trajectory.velocities, axis=1) > 1e-3
-    resting = result.trajectory.times[~moving]
+    resting = result.trajectory.times[np.linalg.norm(result.trajectory.velocities, axis=1) <= 1e-3]
     assert len(resting) >= 4 and np.abs(resting - result.trajectory.times[[0, -1]].mean()).min() > 0.1
-
-
-def test_a_waypoint_between_obstacles_is_blended_no_further_than_is_free() -> None:
-    hand = ROBOT.fk(MIDDLE, "panda_hand")[:3, 3]
-    wall = rd.Box(hand - [0.0, 0.0, 0.18], [0.02, 0.3, 0.1], name="wall")
+    wall = rd.Box(ROBOT.fk(MIDDLE, "panda_hand")[:3, 3] - [0.0, 0.0, 0.18], [0.02, 0.3, 0.1], name="wall")
     problem = rd.Problem(ROBOT, rd.Scene([wall]), START, END, waypoints=[MIDDLE], blend=1.0)
     result = rd.plan(problem, time_limit=10.0)
     assert result.trajectory is not None and verify_trajectory(problem, result.trajectory).valid
@@ -160,9 +155,8 @@ def test_files_keep_goals_and_waypoints(tmp_path: Path) -> None:
         kept = problem_record(problem)
         assert problem_record(problem_from_record(kept)) == kept
         assert isinstance(problem.goal, rd.AnyGoal) and isinstance(problem.goal.goals[0], rd.PoseGoal)
-        T = problem.known_scene.shapes[0].solid()[0]
-        seen = inverse(T) @ problem.goal.goals[0].T_base_frame
-        assert np.allclose(seen[:3, 3], pose["xyz"])
+        T_object_base = inverse(problem.known_scene.shapes[0].solid()[0])
+        assert np.allclose((T_object_base @ problem.goal.goals[0].T_base_frame)[:3, 3], pose["xyz"])
         assert len(problem.waypoints) == 2 and problem.blend == (0.0, 0.05) and kept["blend"] == [0.0, 0.05]
 
 
@@ -201,6 +195,31 @@ def test_poses_are_drawn_on_as_long_as_none_is_free() -> None:
     assert ROBOT.fk(result.path.positions[-1], "panda_hand")[1, 3] < -0.35
 
 
-def test_any_of_goals_may_hold_any_of_goals() -> None:
+class Series:
+    """Numbers with labels, which NumPy does not see, as in pandas."""
+
+    def __init__(self, numbers: dict[Any, float]) -> None:
+        self.keys, self.numbers = numbers.keys, numbers
+
+    def __getitem__(self, label: Any) -> float:
+        return self.numbers[label]
+
+    __array__ = lambda self, *_, **__: np.array([*self.numbers.values()])  # noqa: E731
+
+
+def test_labels_of_numbers_clearances_of_numpy_and_any_of_any_of_goals() -> None:
+    labelled = dict(zip(ROBOT.joint_names, END, strict=True))
+    for goal in (dict(reversed(labelled.items())), dict(enumerate(END))):
+        problem = rd.Problem(ROBOT, rd.Scene(), START, Series(goal), clearance=np.float32(0.25))  # type: ignore[arg-type]
+        assert {"goal": {"joints": END}, "clearance": 0.25}.items() <= problem_record(problem).items()
+    refuses("unknown joint in goal: 'time'", rd.Problem, ROBOT, rd.Scene(), START, Series(labelled | {"time": 0.0}))
     one, two, three = (rd.JointGoal(np.full(7, x)) for x in (0.1, 0.2, 0.3))
     assert rd.AnyGoal((one, rd.AnyGoal((two, three)))).goals == (one, two, three)  # type: ignore
+
+
+def test_poses_of_few_decimals_can_be_moved_by_a_base_of_few_decimals() -> None:
+    T = rd.pose([0.3, 0.1, 0.2], wxyz=[0.9, 0.2, 0.3, 0.1]).round(4)
+    box = rd.MovingObstacle(rd.Box([0.5, 0, 0], [0.1] * 3), times=[0, 1], poses=[rd.pose([0.5, 0, 0])] * 2)
+    goal = rd.PoseGoal("panda_hand", T)
+    problem = rd.Problem.in_world(T, rd.load_robot("panda"), rd.Scene(), "ready", goal, moving=[box])
+    np.testing.assert_allclose(problem.goal.T_base_frame, np.eye(4), atol=1e-3)  # type: ignore[union-attr]

@@ -7,7 +7,7 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.refusals import refuses
-from robotdiffuse.problems.held_out import Case, CaseFile, held_out_problem, line_length
+from robotdiffuse.problems.files import Case, CaseFile, held_out_problem, line_length
 
 
 class Referee:

@@ -11,7 +11,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, distinct
@@ -21,6 +21,7 @@ from robotdiffuse.core.types import (
     Configurations,
     JointRows,
     JointValues,
+    Mask,
     Pose,
     Rotation,
     Values,
@@ -148,7 +149,7 @@ class PathConstraints:
         """The largest allowed value of each row, if a fraction of its tolerance may be used [m] or [rad]."""
         return self.rows.limit - (1 - tolerance_fraction) * self.rows.tolerance
 
-    def satisfied(self, q: Configurations, tolerance_fraction: float = 1.0) -> Bool[ndarray, "n"]:
+    def satisfied(self, q: Configurations, tolerance_fraction: float = 1.0) -> Mask:
         """Which configurations satisfy all constraints within a fraction of their tolerances."""
         return np.all(self.values(q) <= self.limits(tolerance_fraction), axis=1)
 
@@ -160,7 +161,7 @@ class PathConstraints:
 
     def project(
         self, q: Configurations, tolerance_fraction: float, most: int = -1
-    ) -> tuple[Configurations, Bool[ndarray, "n"]]:
+    ) -> tuple[Configurations, Mask]:
         """Like `projected`, but returns all configurations, and which of them keep the tolerances."""
         rows = np.array(q, np.float64, order="C")
         return rows, project_each(self.rows, self.limits(tolerance_fraction), rows, most)
@@ -228,13 +229,11 @@ class PathConstraints:
         following = min(segment + 1, len(q) - 1)
         at = q[segment] + fraction * (q[following] - q[segment])
         remaining = np.concatenate([at[None], q[following:]])
-        lengths = np.linalg.norm(np.diff(remaining, axis=0), axis=1)
-        knots = np.concatenate([[0.0], np.cumsum(lengths)])
+        knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(remaining, axis=0), axis=1))])
         near = np.geomspace(MIN_SEGMENT_FRACTION, VIOLATION_STEP, 64)
         s = np.unique(np.concatenate([near, VIOLATION_STEP * np.arange(VIOLATION_STEPS), knots]))
         s = s[s <= min(knots[-1], VIOLATION_STEP * VIOLATION_STEPS)]
-        places = interpolated(s, knots, remaining)
-        values = self.values(places)[:, row]
+        values = self.values(interpolated(s, knots, remaining))[:, row]
         over = values > self.rows.limit[row]
         ends = np.flatnonzero(over[:-1] & ~over[1:])  # the last places of violations
         return float(values[: ends[0] + 1 if len(ends) else None].max())

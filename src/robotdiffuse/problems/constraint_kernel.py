@@ -12,8 +12,8 @@ the value of each must not exceed a limit:
 - ROLL_PITCH_YAW: the largest excess of roll, pitch or yaw, relative to a reference, over its tolerance [rad].
   Only goals have such rows, not motions.
 
-The poses at the two ends of a piece of a motion prove that the piece satisfies a row. Along the piece, the
-joints move by dq at constant rates.
+From the poses at the two ends of a piece of a motion, a bound for the whole piece is computed. Along the
+piece, the joints move by dq at constant rates.
 
 - DISTANCE: the frame's origin p leaves the straight line between the two ends by at most an eighth of the
   second derivative of p. This derivative is at most sum_jk |dq_j dq_k| r[max(j, k)], where r[k], the lever

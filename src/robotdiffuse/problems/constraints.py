@@ -57,7 +57,8 @@ class FrameConstraint(Value):
     """Name of the link."""
 
     def __post_init__(self) -> None:
-        """Checks each field by its name: link, vectors, directions, and scalars within their bounds."""
+        """Checks each field by its name: link, vectors, directions, scalars within their bounds, and the pose
+        of the box."""
         for field in fields(self):
             name = field.name
             content: Any = getattr(self, name)
@@ -68,7 +69,7 @@ class FrameConstraint(Value):
                 row = vector(self.kind, name, content, 3)
                 length = float(np.linalg.norm(row))
                 if name in DIRECTION_FIELDS and length < 1e-6:
-                    raise InputError(f"{location} is {shown(row)}; it must not be zero")
+                    raise InputError(f"{location} is {shown(row)}; its length must be at least 1e-6")
                 content = row if name not in DIRECTION_FIELDS or abs(length - 1) < 1e-15 else row / length
             if name in SCALAR_BOUNDS and not (content is None and NoneType in get_args(field.type)):
                 low, high, unit = SCALAR_BOUNDS[name]
@@ -166,9 +167,9 @@ class CartesianLine(FrameConstraint):
     """The origin of a link moves on the straight segment from its start position to its goal position.
 
     The goal must therefore determine the pose of the link. It may be a configuration, several configurations
-    with the link at the same pose, or poses of links. One of them, without tolerances, must then be of this
-    link or of one rigidly connected to it. The orientation follows the shortest rotation from start to goal,
-    in proportion to the fraction of the segment traveled.
+    with the link at the same pose, or poses of links. Among poses, one without tolerances must be of
+    this link or of one rigidly connected to it. The orientation follows the shortest rotation from start to
+    goal, in proportion to the fraction of the segment traveled.
     """
 
     kind: ClassVar[str] = "cartesian_line"

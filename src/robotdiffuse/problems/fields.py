@@ -34,6 +34,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robotdiffuse.core.errors import InputError, check_name, located, numbers, shown, unit_quaternion, vector
+from robotdiffuse.core.files import JsonObject
 from robotdiffuse.core.settings import converted
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.core.types import Pose
@@ -63,11 +64,10 @@ from robotdiffuse.scenes.files import (
     required_fields,
     scene_entries,
 )
-from robotdiffuse.scenes.moving_obstacles import MovingObstacle
-from robotdiffuse.scenes.scene import ALL_LINKS, Scene
+from robotdiffuse.scenes.scene import ALL_LINKS, MovingObstacle, Scene
 from robotdiffuse.scenes.shapes import IDENTITY, Shape
 
-Schema = dict[str, Any]
+Schema = JsonObject
 NUMBER: Schema = {"type": "number"}
 TEXT: Schema = {"type": "string"}
 OBJECT: Schema = {"type": "object"}
@@ -93,7 +93,8 @@ ROWS = _array(NUMBERS)
 SHAPE, GOAL, POSE_OF_LINK = ({"$ref": f"#/$defs/{name}"} for name in ("shape", "goal", "pose"))
 VALUES: dict[str, Schema] = {
     **dict.fromkeys(("name", "file", "frame"), TEXT),
-    **dict.fromkeys(("points", "vertices", "faces", "heights"), ROWS),
+    **dict.fromkeys(("points", "vertices", "faces"), ROWS),
+    "heights": _array(_array({"type": ["number", "null"]})),
     **dict.fromkeys(
         ("center", "size", "xyz", "axis", "direction", "normal", "point", "low", "high"), NUMBERS
     ),
@@ -125,9 +126,12 @@ def _fields_of(kind: type) -> tuple[dict[str, Schema], list[str]]:
     """Schemas of the fields of a shape or constraint in a file, by name, and its required fields."""
     schemas: dict[str, Schema] = {}
     for field in fields(kind):
-        schemas |= (
-            POSE if field.name in ("wxyz", "T_base_box") else {field.name: VALUES.get(field.name, NUMBER)}
-        )
+        if field.name == "T_base_box":
+            schemas |= POSE
+        elif field.name == "wxyz":
+            schemas |= {name: POSE[name] for name in ("wxyz", "rpy")}
+        else:
+            schemas[field.name] = VALUES.get(field.name, NUMBER)
     return schemas, required_fields(kind)
 
 
@@ -146,7 +150,7 @@ def read_pose(where: str, data: object) -> Pose:
     return pose_of(where, check_fields(where, data, (), POSE))
 
 
-def pose_of(where: str, values: dict[str, Any]) -> Pose:
+def pose_of(where: str, values: JsonObject) -> Pose:
     """The transform of the fields xyz and wxyz, both optional; other fields are ignored. `check_fields` has
     converted rpy to wxyz."""
     xyz = vector(where, "xyz", values.get("xyz", (0.0, 0.0, 0.0)), 3)
@@ -176,23 +180,27 @@ def _text(where: str, value: object) -> str:
     return value
 
 
-def _touch_links(where: str, entry: dict[str, Any]) -> tuple[str, ...]:
+def _touch_links(where: str, entry: JsonObject) -> tuple[str, ...]:
     return converted(f"{where}.touch_links", tuple[str, ...], entry.get("touch_links", ()))
 
 
-def equipped(robot: Robot, values: dict[str, Any], folder: Path, notes: list[str]) -> Robot:
+def equipped(robot: Robot, values: JsonObject, folder: Path, notes: list[str]) -> Robot:
     """The robot with the tool and the attached objects of a problem file.
 
     folder: file names of meshes are relative to it. notes: notes on the shapes are added to this list. Raises
     InputError that names the field, for unknown fields and for values that `Robot.attach` does not accept.
     """
+    waiting = None
+    needed = set[str]()
     if values.get("tool") is not None:
         tool = check_fields("tool", values["tool"], ("link",), TOOL_FIELDS)
         shapes, shape_notes = read_scene(tool.get("shapes", []), folder, field="tool.shapes")
         notes += shape_notes
         link = _text("tool.link", tool["link"])
         name = _text("tool.name", tool.get("name", TOOL))
-        robot = robot.with_tool(link, pose_of("tool", tool), shapes.shapes, _touch_links("tool", tool), name)
+        touch = _touch_links("tool", tool)
+        waiting = link, pose_of("tool", tool), shapes.shapes, touch, name
+        needed = {link, *touch}
     attached = values.get("attached")
     objects = [] if attached is None else attached
     for location, entry in entries_of("attached", objects, "objects, each with a link"):
@@ -202,18 +210,28 @@ def equipped(robot: Robot, values: dict[str, Any], folder: Path, notes: list[str
                 "{link: panda_hand, box: {...}}"
             )
         shape = {key: value for key, value in entry.items() if key not in ("link", "touch_links")}
+        if waiting is not None and needed <= {*robot.link_names}:
+            robot = robot.with_tool(*waiting)
+            waiting = None
         with located(location):
             attached_shape = read_shape(location, shape, folder, notes)
             touch = _touch_links(location, entry)
             robot = robot.attach(attached_shape, _text(f"{location}.link", entry["link"]), touch)
-    return robot
+    # its link, or one that it may touch, may be a held object
+    return robot if waiting is None else robot.with_tool(*waiting)
 
 
-def equipment_entries(robot: Robot, folder: Path | None) -> dict[str, Any]:
+def equipment_entries(robot: Robot, folder: Path | None) -> JsonObject:
     """The fields `tool` and `attached` of a robot, in the form that `equipped` reads."""
-    entries: dict[str, Any] = {}
+    entries: JsonObject = {}
     for body in robot.attached:
-        shapes = scene_entries(Scene([s for s in body.shapes if isinstance(s, Shape)]), folder)
+        solids = [shape for shape in body.shapes if isinstance(shape, Shape)]
+        if len(solids) < len(body.shapes) or not (body.tool or len(solids) == 1):
+            raise InputError(
+                f"{body.name} has the shapes {shown(body.shapes)}; a problem file holds only shapes of "
+                "scenes, and exactly one for each attached object"
+            )
+        shapes = scene_entries(Scene(solids), folder)
         touch = {"touch_links": list(body.touch_links)} if body.touch_links else {}
         if body.tool:
             at = {"link": body.link, "name": body.name, **rounded(pose_entry(body.T_link_body))}
@@ -266,7 +284,8 @@ def read_goal(where: str, data: object, setting: Setting) -> Goal:
     if array is None or array.ndim != (1 if kind == "joints" else 2):
         form = "a list of numbers" if kind == "joints" else "a list of configurations of one length"
         raise InputError(f"{where} is {shown(value)}; it must be {form}")
-    return JointGoal(array)
+    with located(where):
+        return JointGoal(array)
 
 
 def _pose_goal(where: str, value: object, scene: Scene, frame: object = None) -> PoseGoal:
@@ -283,10 +302,11 @@ def _pose_goal(where: str, value: object, scene: Scene, frame: object = None) ->
         check_name(f"object in {where}.relative_to:", name, shapes)
         with located(f"{where}.relative_to"):
             T = shapes[name].T_base_shape @ T
-    return PoseGoal(pose["frame"], T, *(pose.get(name) for name in TOLERANCES))  # type: ignore[arg-type]
+    with located(where):
+        return PoseGoal(pose["frame"], T, *(pose.get(name) for name in TOLERANCES))  # type: ignore[arg-type]
 
 
-def goal_entry(goal: Goal) -> dict[str, Any]:
+def goal_entry(goal: Goal) -> JsonObject:
     """The entry of a goal, in the form that `read_goal` reads."""
     if isinstance(goal, AnyGoal):
         return {"any": [goal_entry(part) for part in goal.goals]}
@@ -298,7 +318,7 @@ def goal_entry(goal: Goal) -> dict[str, Any]:
     return {"pose": {"frame": goal.frame, **_pose_goal_entry(goal)}}
 
 
-def _pose_goal_entry(pose: PoseGoal) -> dict[str, Any]:
+def _pose_goal_entry(pose: PoseGoal) -> JsonObject:
     tolerances = {name: getattr(pose, name) for name in TOLERANCES}
     tolerance_entry = {name: value.tolist() for name, value in tolerances.items() if value is not None}
     return {**pose_entry(pose.T_base_frame), **tolerance_entry}
@@ -318,7 +338,7 @@ def _constraint(where: str, entry: object) -> Constraint:
         raise InputError(f"{where}.{error}") from None
 
 
-def constraint_entry(constraint: Constraint) -> dict[str, Any]:
+def constraint_entry(constraint: Constraint) -> JsonObject:
     """The entry of a constraint in a problem file."""
     values = plain_fields(constraint, "T_base_box")
     T = getattr(constraint, "T_base_box", None)
@@ -340,7 +360,7 @@ def _moving(where: str, entry: object, setting: Setting) -> MovingObstacle:
             f"{where} has the fields {', '.join(map(str, entry))}; it must have one shape of "
             f"{', '.join(SHAPES)}, and a motion of {', '.join(MOTION_FIELDS)}"
         )
-    obstacle_shape = read_shape(where, shape, setting.folder, [])
+    obstacle_shape = read_shape(where, shape, setting.folder, setting.notes)
     with located(where):
         if "poses" in motion:
             poses = entries_of("poses", motion["poses"], "{xyz, wxyz}")
@@ -348,7 +368,7 @@ def _moving(where: str, entry: object, setting: Setting) -> MovingObstacle:
         return MovingObstacle(obstacle_shape, **motion)
 
 
-def moving_entry(obstacle: MovingObstacle, folder: Path | None) -> dict[str, Any]:
+def moving_entry(obstacle: MovingObstacle, folder: Path | None) -> JsonObject:
     """The entry of a moving obstacle in a problem file; files of meshes are named relative to `folder`."""
     [shape] = scene_entries(Scene([obstacle.shape]), folder)
     unset = [name for name in MOTION_FIELDS if getattr(obstacle, name) is None]
@@ -391,7 +411,10 @@ FIELDS = {
         in_world=True,
     ),
     "start": Field(
-        {"oneOf": [NUMBERS, TEXT], "description": "joint values [rad or m], or a named pose"},
+        {
+            "oneOf": [NUMBERS, TEXT, OBJECT | {"additionalProperties": NUMBER}],
+            "description": "joint values [rad or m], as a list or by joint, or a named pose",
+        },
         write=lambda value, folder: value.tolist(),
         with_request=False,
     ),
@@ -484,5 +507,9 @@ def problem_schema() -> Schema:
         "title": "RobotDiffuse problem",
         **_object(SETUP | {name: field.schema for name, field in FIELDS.items()}, "robot", "scene"),
         "anyOf": [{"required": ["start", "goal"]}, {"required": ["request"]}],
-        "$defs": {"shape": _one_of(shapes), "goal": goal, "pose": _object(GOAL_POSE)},
+        "$defs": {
+            "shape": _one_of(shapes),
+            "goal": goal,
+            "pose": _object({name: field for name, field in GOAL_POSE.items() if name != "frame"}),
+        },
     }

@@ -1,19 +1,29 @@
 """Reads and writes problem files: YAML or JSON with one problem, JSON lines with many.
 
 Also reads folders of MotionBenchMaker, which hold MoveIt files.
+
+Held-out problems for evaluation are numbered random problems of each family, none of which is in a data set.
+A problem is trivial if the straight line from the start to a goal configuration passes the validator. It is
+hard if it is not trivial and a search solves it. `CaseFile` keeps them in JSON lines of its own, which also
+store whether each problem is trivial, and the length of its shortest known path.
 """
 
+import itertools
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Integral
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
-from robotdiffuse.core.errors import InputError, check_name, check_type, counted, located, shown
-from robotdiffuse.core.input_files import (
+from robotdiffuse.core.errors import InputError, check_name, check_type, counted, located, repeated, shown
+from robotdiffuse.core.files import (
+    JsonLines,
+    JsonObject,
+    append_line,
     file_name,
     known_ending,
     no_files,
@@ -21,10 +31,13 @@ from robotdiffuse.core.input_files import (
     parse_yaml,
     read_text,
     read_yaml,
+    write_atomically,
 )
-from robotdiffuse.core.output_files import append_line, write_atomically
 from robotdiffuse.core.settings import Number, converted
 from robotdiffuse.core.transforms import pose_entry
+from robotdiffuse.core.types import Configuration
+from robotdiffuse.core.types import Path as Waypoints
+from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.fields import (
     FIELDS,
     SETUP,
@@ -35,7 +48,10 @@ from robotdiffuse.problems.fields import (
     rounded,
 )
 from robotdiffuse.problems.moveit import (
+    SCENE,
     MoveItRequest,
+    joint_state,
+    mapping_of,
     moveit_frames,
     moveit_model,
     moveit_request,
@@ -136,11 +152,15 @@ def _lines(text: str) -> list[tuple[int, str]]:
 def problem_record(
     problem: Problem, folder: str | Path | None = None, robot: str | None = None
 ) -> dict[str, object]:
-    """Convert a problem to JSON values. Numbers are kept exactly, but transformed poses have 12 decimals.
+    """Convert a problem to JSON values.
+
+    Numbers are kept exactly, except that the poses of base and tool and, with a base, all numbers of fields
+    in the frame of the world have 12 decimals.
 
     Args:
         problem: The problem.
-        folder: Files in it or below it are named relative to it, others by their full path.
+        folder: Files of shapes and views in it or below it are named relative to it, others by their full
+            path.
         robot: The name of the robot, or the path of its URDF, to write; None: the name or path from which
             the robot was loaded.
 
@@ -160,7 +180,7 @@ def problem_record(
     folder = None if folder is None else Path(folder)
     T = problem.T_world_base
     scene = problem.known_scene
-    record: dict[str, object] = {"robot": robot, "locked": problem.robot.locked}
+    record: dict[str, object] = {"robot": str(robot), "locked": dict(problem.robot.locked)}
     if T is not None:
         record["base"] = rounded(pose_entry(T))
     record |= equipment_entries(problem.robot, folder)
@@ -192,18 +212,24 @@ def problem_from_record(record: object, robots: Mapping[str, Robot] | None = Non
 def save_problem(problem: Problem, file: str | Path, robot: str | None = None) -> None:
     """Write a problem to .yaml, .yml or .json (atomically), or append it as a line to .jsonl.
 
-    `robot` as in `problem_record`. Raises InputError as `problem_record` does, and if the file cannot be
-    written.
+    `robot` as in `problem_record`. Raises InputError as `problem_record` does, for another ending, and if the
+    file cannot be written.
     """
     file = file_name(file, "problem file")
     ending = known_ending(file, "problem file", WRITERS)
     text = WRITERS[ending](problem_record(problem, file.parent, robot))
-    write = append_line if ending == ".jsonl" else write_atomically
-    write(file, text)
+    (append_line if ending == ".jsonl" else write_atomically)(file, text)
+
+
+class _Dumper(yaml.CSafeDumper):
+    """Also writes NumPy's texts, such as names from an array."""
+
+
+_Dumper.add_multi_representer(str, lambda dumper, text: dumper.represent_str(str(text)))
 
 
 def _yaml(data: dict[str, object]) -> str:
-    return yaml.dump(data, Dumper=yaml.CSafeDumper, sort_keys=False, default_flow_style=None, width=110)
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=110)
 
 
 WRITERS: dict[str, Callable[[dict[str, object]], str]] = {
@@ -265,6 +291,11 @@ def _requested(
             implied = f"it mimics {joint.mimic.joint}: held at {locked:g}"
             notes.append(f"start_state: {joint.name} is {start_value:g}, but {implied}")
 
+    for i, values in enumerate(request.joint_goals):
+        for name, value in values.items():
+            held = robot.locked.get(name, value)
+            if abs(held - value) > MIMIC_SLACK:
+                notes.append(f"goal_constraints[{i}]: {name} is {value:g}, but it is held at {held:g}")
     start = robot.planned_values("start_state", request.start)
     for attached in request.attached:
         robot = attached.held_by(robot, start)
@@ -333,6 +364,11 @@ def _problem(
         if request is not None:
             with located(request_place):
                 notes += request.robot_notes(robot, moveit_model(content), ignore_joints)
+                # as in MoveIt, joints that the request leaves out start where the scene has them
+                mimics = {joint.name for joint in robot.joints if joint.mimic is not None}
+                current = joint_state(mapping_of(SCENE, content, "robot_state"), "robot_state")
+                current = {name: value for name, value in current.items() if name not in mimics}
+                request = replace(request, start=current | request.start)
                 return _requested(robot, scene, request, notes, options)
         if base is None:
             return Problem(robot, scene, notes=tuple(notes), **options)
@@ -346,7 +382,168 @@ def _robot(name: object, locked: object, folder: Path, robots: Mapping[str, Robo
         raise InputError(
             f"robot is {shown(name)}; it must be a name ({', '.join(ROBOTS)}, or added) or a robot's file"
         )
-    if name not in ROBOTS and (name.endswith(FILE_ENDINGS) or "/" in name):
+    if robots is None and name not in ROBOTS and (name.endswith(FILE_ENDINGS) or "/" in name):
         name = str((folder / name).absolute())
     values = converted("locked", dict[str, Number], locked)
     return load_robot(name, locked=values) if robots is None else robots[name].with_locked(values)
+
+
+SEED = 20261121
+"""Seed of the held-out problems; data sets use other seed sequences."""
+
+Validator = Callable[[Problem, Waypoints], bool]
+"""A function that says whether a path solves a problem."""
+Search = Callable[[Problem], float | None]
+"""A function that searches for paths of a problem and returns the length of the shortest path [rad], or None
+if it finds no path."""
+Progress = Callable[[str], None]
+"""A function that receives progress messages."""
+REPORT_EVERY = 20
+"""Number of problems between two progress messages."""
+
+
+def goal_of(problem: Problem) -> Configuration:
+    """The first goal configuration of a problem whose goal is a JointGoal."""
+    assert isinstance(problem.goal, JointGoal)
+    return problem.goal.positions[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A problem of an evaluation, with what is known about its solutions."""
+
+    name: str
+    """Unique name in the problem set; rop/17 is number 17 of the family rop."""
+    family: str
+    """Group in plots and tables: the random family, or the folder or file of the problem."""
+    problem: Problem
+    trivial: bool
+    """Whether the straight line to a goal configuration passes the validator."""
+    reference: float | None = None
+    """Length of the shortest known path [rad]: of the straight line if trivial, else of a search's path; None
+    if no search ran, or if it found no path."""
+    problem_set: str = ""
+    """Name of the problem set: the name of a family, or of a file or folder without its ending."""
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Unique among several problem sets."""
+        return self.problem_set, self.name
+
+    @property
+    def hard(self) -> bool:
+        """Whether the problem is not trivial and a search solves it."""
+        return not self.trivial and self.reference is not None
+
+
+def held_out_problem(family: str, number: int) -> Problem:
+    """Problem `number` of a family, for the Panda. Some problems are trivial, others unsolvable."""
+    FAMILIES.entry(family)
+    index = list(FAMILIES).index(family)
+    # the seeds of the published problems
+    rng = np.random.default_rng([SEED, number] if index == 0 else [SEED, 10 + index, number])
+    if index > 1:
+        rng.random()  # the generator of the published problems drew one number more
+    robot = load_robot("panda")
+    return load_family(family).draw(robot, rng).problem(robot)
+
+
+def line_length(problem: Problem, validator: Validator) -> float | None:
+    """Length of the shortest straight line, from the start to a goal configuration, that passes the validator
+    [rad]; None if no such line does."""
+    goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
+    lines = [Waypoints(problem.robot.joint_names, np.stack([problem.start, goal])) for goal in goals]
+    return min((line.length for line in lines if validator(problem, line)), default=None)
+
+
+ROW_FIELDS = {"name", "family", "trivial", "searched", "reference", "problem"}
+"""Fields of a line of a file: the fields of a case, whether a search for the reference length has run, and
+the record of the problem."""
+
+
+class CaseFile:
+    """Cases by name, in the order of their addition, stored in a file or, if no file is given, in memory."""
+
+    def __init__(self, file: Path | None) -> None:
+        """Reads the file. Raises InputError, which names file and line, for a line that does not hold the
+        fields of a row. The problems are checked when cases are made of them."""
+        self._lines = JsonLines(file)
+        self._rows: dict[str, JsonObject] = {}
+        for number, row in enumerate(self._lines.rows, start=1):
+            if row.keys() != ROW_FIELDS:
+                raise InputError(
+                    f"{file}, line {number} has {', '.join(row)} instead of {', '.join(sorted(ROW_FIELDS))}; "
+                    "remove the file to generate its problems again"
+                )
+            self._rows[row["name"]] = row  # a later line on the same problem adds the search's result
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def cases(self, hard: bool = False) -> list[Case]:
+        """All cases, or only the cases that are known to be hard."""
+        return [_case(row) for row in self._rows.values() if not hard or _is_hard(row)]
+
+    def fill(self, cases: list[Case]) -> None:
+        """Replaces all cases atomically. Raises InputError if two have the same name."""
+        twice = repeated(case.name for case in cases)
+        if twice:
+            raise InputError(f"two problems are called {twice[0]}; rename one of their files")
+        self._lines.replace([_row(case) for case in cases])
+        self._rows = {row["name"]: row for row in self._lines.rows}
+
+    def held_out(
+        self,
+        family: str,
+        count: int,
+        validator: Validator,
+        search: Search | None = None,
+        report: Progress = lambda text: None,
+    ) -> list[Case]:
+        """The first `count` held-out problems of a family; with a search, the first `count` hard problems.
+
+        Problems that are not in the file yet are generated and added; with a search, problems that are
+        neither trivial nor searched yet are searched.
+        """
+        case_rows: list[JsonObject] = []
+        numbers = itertools.count()
+        while len(case_rows) < count:
+            number = next(numbers)
+            row = self._rows.get(f"{family}/{number}")
+            if row is None:
+                problem = held_out_problem(family, number)
+                line = line_length(problem, validator)
+                row = self._add(_row(Case(f"{family}/{number}", family, problem, line is not None, line)))
+            if search is not None and not (row["trivial"] or row["searched"]):
+                row = self._add(row | {"searched": True, "reference": search(_case(row).problem)})
+            if search is None or _is_hard(row):
+                case_rows.append(row)
+                if len(case_rows) % REPORT_EVERY == 0 or len(case_rows) == count:
+                    report(f"problems: {len(case_rows)} of {count} of {family}")
+        return [_case(row) for row in case_rows]
+
+    def _add(self, row: JsonObject) -> JsonObject:
+        self._lines.append(row)
+        self._rows[row["name"]] = row
+        return row
+
+
+def _is_hard(row: JsonObject) -> bool:
+    return not row["trivial"] and row["reference"] is not None
+
+
+def _case(row: JsonObject) -> Case:
+    with located(f"the stored problem {shown(row['name'])}"):
+        problem = problem_from_record(row["problem"])
+    return Case(row["name"], row["family"], problem, row["trivial"], row["reference"])
+
+
+def _row(case: Case) -> JsonObject:
+    return {
+        "name": case.name,
+        "family": case.family,
+        "trivial": case.trivial,
+        "searched": False,
+        "reference": case.reference,
+        "problem": problem_record(case.problem),
+    }

@@ -26,7 +26,7 @@ from robotdiffuse.core.errors import (
     unknown_name,
     vector,
 )
-from robotdiffuse.core.input_files import read_yaml
+from robotdiffuse.core.files import JsonObject, read_yaml
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import (
     inverse,
@@ -56,14 +56,16 @@ OBJECT_FIELDS = (
     *("header", "pose", "id", "type", "primitives", "primitive_poses", "meshes", "mesh_poses", "planes"),
     *("plane_poses", "subframe_names", "subframe_poses", "operation"),
 )
+REMOVALS = (1, 3, "\1", "\3", b"\1", b"\3")
+"""Values of an object's field `operation` that mean to remove or to move it."""
 
 # Edge length and thickness of the box that stands for a plane [m].
 PLANE_EXTENT = 20.0
 PLANE_THICKNESS = 0.01
 MAX_PLANES = 1000
 """Maximum number of planes in a collision object; each becomes a box."""
-WIDE_REGION = 0.02
-"""A goal region with a dimension above this, twice the validator's tolerance, gets a note [m]."""
+WIDE_REGION = 0.01
+"""A goal region with a dimension above this, the validator's tolerance, gets a note [m]."""
 WIDE_ANGLE = 0.2618
 """A goal orientation with a tolerance above this, the validator's tolerance, gets a note [rad]."""
 NO_POSE = {"position": [0, 0, 0], "orientation": [0, 0, 0, 1]}
@@ -71,7 +73,7 @@ TYPE_NUMBERS = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone", 5: "prism"}
 """Names of the types of shape_msgs/SolidPrimitive, by their numbers in messages."""
 
 
-def mapping_of(where: str, value: object, *names: str) -> dict[str, Any]:
+def mapping_of(where: str, value: object, *names: str) -> JsonObject:
     """The value as a mapping, or the mapping in its nested field names[0].names[1]...; None counts as empty.
 
     where: the place of the value, for messages.
@@ -84,7 +86,7 @@ def mapping_of(where: str, value: object, *names: str) -> dict[str, Any]:
     return value or {}
 
 
-def list_of(where: str, entry: dict[str, Any], name: str) -> list[Any]:
+def list_of(where: str, entry: JsonObject, name: str) -> list[Any]:
     """The list in the field `name` of an entry; None counts as empty. where: prefix of the field's name in
     messages."""
     value = entry.get(name)
@@ -93,7 +95,7 @@ def list_of(where: str, entry: dict[str, Any], name: str) -> list[Any]:
     return value or []
 
 
-def mappings_of(where: str, entry: dict[str, Any], name: str) -> list[tuple[str, dict[str, Any]]]:
+def mappings_of(where: str, entry: JsonObject, name: str) -> list[tuple[str, JsonObject]]:
     """The mappings of the list in the field `name`, each with its place for messages."""
     places = [(f"{where}{name}[{i}]", value) for i, value in enumerate(list_of(where, entry, name))]
     return [(place, mapping_of(place, value)) for place, value in places]
@@ -113,7 +115,7 @@ def pose_of(where: str, value: object, position: str = "position", orientation: 
     return transform(xyz_of(f"{where}.{position}", value.get(position)), rotation_from_quaternion(wxyz))
 
 
-def joint_state(state: dict[str, Any], where: str) -> dict[str, float]:
+def joint_state(state: JsonObject, where: str) -> dict[str, float]:
     """Joint values by joint name of a RobotState."""
     joints = mapping_of(where, state, "joint_state")
     where = f"{where}.joint_state"
@@ -122,7 +124,7 @@ def joint_state(state: dict[str, Any], where: str) -> dict[str, float]:
     return dict(zip(map(str, names), positions.tolist(), strict=True))
 
 
-def frame_name(where: str, entry: dict[str, Any]) -> str:
+def frame_name(where: str, entry: JsonObject) -> str:
     """The frame_id in the header of an entry, without a leading slash."""
     return str(mapping_of(where, entry, "header").get("frame_id") or "").removeprefix("/")
 
@@ -138,8 +140,9 @@ def read_moveit_scene(
     links that are fixed to the base. The allowed collision matrix says which links may touch which objects;
     its entries for two links are ignored, because the robot has its own pairs of links to check.
 
-    Raises InputError, naming file and object, for a missing or damaged file, unknown frames, shapes that are
-    not supported (prisms), and, unless `ignore_joints`, joints that the robot lacks.
+    Raises InputError, naming file and object, for a missing or damaged file, unknown fields and frames,
+    shapes that are not supported (prisms, octomaps that are not binary, meshes that are not files), objects
+    attached to robot_state, and, unless `ignore_joints`, joints that the robot lacks.
     """
     data = read_yaml(file)
     with located(file):
@@ -158,8 +161,10 @@ class MoveItFrames(dict[str, ndarray]):
     """Links of the robot; a file cannot change their poses."""
     unknown_reason: str = ""
     """Why the pose of the scene's own frame is unknown; empty if it is known."""
+    T_own_root: Pose = np.eye(4)
+    """Pose of the robot's root in the scene's own frame."""
 
-    def of_header(self, where: str, entry: dict[str, Any]) -> Pose:
+    def of_header(self, where: str, entry: JsonObject) -> Pose:
         """T_base_frame of the frame that the header of an entry names.
 
         Raises InputError for an unknown frame. The message lists the known frames and, if the pose of the
@@ -181,28 +186,27 @@ def moveit_frames(data: object, robot: Robot) -> MoveItFrames:
     """The frames of a parsed planning scene; `robot` as in `read_moveit_scene`.
 
     The scene's own frame is the frame in which robot_state.multi_dof_joint_state gives the pose of the
-    robot's root, by default `world`. Raises InputError if the field has more than one transform, and if
-    robot_state has attached objects.
+    robot's root, by default `world`. Raises InputError if the field has more than one transform, if
+    robot_state has attached objects, and for wrong transforms and unknown frames.
     """
     if mapping_of(SCENE, data, "robot_state").get("attached_collision_objects"):
-        raise InputError("attached_collision_objects are for the start_state of a request")
+        raise InputError("robot_state has attached_collision_objects; they belong to a request's start_state")
     location = "multi_dof_joint_state"
     floating = mapping_of(SCENE, data, "robot_state", location)
-    transforms = list_of(f"{location}.", floating, "transforms")
-    if len(transforms) > 1:
-        raise InputError(
-            f"{location} has {len(transforms)} transforms; it must have one, of the robot's root"
-        )
-    T_own_root = np.eye(4)
-    if transforms:
-        T_own_root = pose_of(f"{location}.transforms[0]", transforms[0], "translation", "rotation")
+    count = len(list_of(f"{location}.", floating, "transforms"))
+    if count > 1:
+        raise InputError(f"{location} has {count} transforms; it must have one, of the robot's root")
+    root_pose = _root_pose(location, floating)
+    T_own_root = np.eye(4) if root_pose is None else root_pose
     named = frame_name(location, floating)
     frames = MoveItFrames(robot.above | robot.links_fixed_to_base)
     frames.links = frozenset(frames)
+    frames.T_own_root = T_own_root
     if robot.T_base_root is None:
         frames.unknown_reason = f"a joint moves {robot.base} relative to {robot.root}"
     else:
         T_base_own = robot.T_base_root @ inverse(T_own_root)
+        # a header that names the robot's root says nothing about the frame of the scene
         scene_frame = "world" if named in ("", robot.root or robot.base) else named
         frames.update({name: T_base_own for name in ("", scene_frame) if name not in frames.links})
     for location, entry in mappings_of("", mapping_of(SCENE, data), "fixed_frame_transforms"):
@@ -211,6 +215,14 @@ def moveit_frames(data: object, robot: Robot) -> MoveItFrames:
         if not frames.unknown_reason and child not in frames.links:
             frames[child] = frames.of_header(location, entry) @ T
     return frames
+
+
+def _root_pose(location: str, floating: JsonObject) -> Pose | None:
+    """The first transform of a multi_dof_joint_state, that of the robot's root; None if there is none."""
+    transforms = list_of(f"{location}.", floating, "transforms")
+    if not transforms:
+        return None
+    return pose_of(f"{location}.transforms[0]", transforms[0], "translation", "rotation")
 
 
 def moveit_scene(
@@ -230,8 +242,10 @@ def moveit_scene(
             shapes.extend(object_shapes(object_entry, frames, folder))
     names = dict.fromkeys(shape.name for shape in shapes)
     allowed = matrix_contacts(mapping_of(SCENE, data, MATRIX), names, links)
+    scene = Scene(shapes, allowed)
     additional = Scene(shapes, contacts).allowed_contacts  # type: ignore[arg-type]
-    return Scene(shapes, (*allowed.items(), *additional))
+    # both name the renamed shapes, of which one may have the name that another was given
+    return Scene(scene.shapes, (*scene.allowed_contacts, *additional))
 
 
 def matrix_contacts(
@@ -276,7 +290,7 @@ def matrix_contacts(
     return {obstacle: touching for obstacle, touching in touch_links.items() if touching}
 
 
-def _octomap(entry: dict[str, Any], frames: MoveItFrames) -> list[Shape]:
+def _octomap(entry: JsonObject, frames: MoveItFrames) -> list[Shape]:
     """A point cloud whose spheres cover the occupied voxels of an OctomapWithPose; no shape without data."""
     location = "world.octomap"
     message = mapping_of(location, entry, "octomap")
@@ -293,14 +307,19 @@ def _octomap(entry: dict[str, Any], frames: MoveItFrames) -> list[Shape]:
         return [PointCloud(voxels, cover_radius(edge), name="octomap").moved(T)]
 
 
-def object_shapes(entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> list[Shape]:
+def object_shapes(entry: JsonObject, frames: MoveItFrames, folder: Path) -> list[Shape]:
     """The shapes of a CollisionObject in the frame of the robot's base, each named like the object.
 
     folder: names of mesh files are relative to it.
     """
     check_fields("the object", entry, (), OBJECT_FIELDS)
+    if entry.get("operation") in REMOVALS:
+        raise InputError(
+            f"operation is {shown(entry['operation'])}; only objects that are added (0) or appended (2) can "
+            "be read"
+        )
     T_base_object = frames.of_header("header", entry) @ pose_of("pose", entry.get("pose") or NO_POSE)
-    name = str(entry.get("id") or "object")
+    name = "object" if entry.get("id") in (None, "") else str(entry["id"])
     shapes: list[Shape] = []
     for key, plural in (("plane", "planes"), ("primitive", "primitives"), ("mesh", "meshes")):
         parts = mappings_of("", entry, plural)
@@ -330,13 +349,13 @@ def object_shapes(entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> 
     return shapes
 
 
-def _triangles(where: str, part: dict[str, Any], folder: Path) -> tuple[ndarray, ndarray]:
+def _triangles(where: str, part: JsonObject, folder: Path) -> tuple[ndarray, ndarray]:
     """Vertices and faces of a mesh."""
     if "resource" in part:
         file = str(part["resource"]).removeprefix("file://")
         if "://" in file:
             raise InputError(f"{where}.resource is {file}; it must be a file, or the mesh must have vertices")
-        vertices, faces = read_triangles(folder / file)
+        vertices, faces = read_triangles(folder / file, turn=False)
         return vertices * vector(where, "dimensions", part.get("dimensions", [1, 1, 1]), 3), faces
     rows = [xyz_of(f"{where}.vertices", row) for row in list_of(f"{where}.", part, "vertices")]
     triangles = list_of(f"{where}.", part, "triangles")
@@ -400,6 +419,10 @@ def scene_robot_notes(data: object, robot: Robot, ignore_joints: bool = False) -
     notes = []
     if model not in ("", robot.name):
         notes.append(f"the scene's robot_model_name is {shortened(model)}; planned for {robot.name}")
+    if mapping_of(SCENE, data).get("is_diff"):
+        notes.append(
+            "the scene is a difference (is_diff); obstacles of the scene that it changes are missing"
+        )
     notes += joint_notes("robot_state.joint_state", values, robot, model, ignore_joints)
     for name, neutral in (("padding", 0), ("scale", 1)):
         entries = mappings_of("", mapping_of(SCENE, data), f"link_{name}")
@@ -444,8 +467,8 @@ class MoveItAttached:
     link: str
     shapes: tuple[Shape, ...]
     in_link: bool
-    """Whether the shapes are in the frame of the link; otherwise they are in the frame of the base, where the
-    link holds them at the start."""
+    """Whether the shapes are in the frame of the link; otherwise they are in the frame of the base, at
+    their poses at the start."""
     touch_links: tuple[str, ...] = ()
 
     def held_by(self, robot: Robot, start: list[float]) -> Robot:
@@ -488,10 +511,11 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
 
     frames: the frames of the request's scene. folder: names of mesh files are relative to it.
 
-    Several joint goal constraints are alternative goals. A position and an orientation constraint of one link
-    are a pose goal at the center of the position's region; the region's size and the orientation's tolerances
-    are ignored, with a note if they are large. Raises InputError for other goals, and for path constraints,
-    because ignoring them would change the problem.
+    Several joint goal constraints are alternative goals; their tolerances are ignored. A position and an
+    orientation constraint of one link are a pose goal at the center of the position's region; the region's
+    size and the orientation's tolerances are ignored, with a note if they are large. Raises InputError for
+    other goals, path and trajectory constraints, reference trajectories and max_cartesian_speed, because
+    ignoring them would change the problem; and for scaling factors that are not from 0 to 1.
     """
     data = mapping_of(REQUEST, data)
     for name in ("path_constraints", "trajectory_constraints"):
@@ -515,7 +539,17 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
         _attached(location, entry, frames, folder)
         for location, entry in mappings_of("", state, "attached_collision_objects")
     )
+    notes += [
+        f"start_state: {body.name}, which {body.link} holds, has no shapes: it is not checked for collisions"
+        for body in attached
+        if not body.shapes
+    ]
     start = joint_state(state, "start_state")
+    location = "start_state.multi_dof_joint_state"
+    floating = mapping_of("start_state", state, "multi_dof_joint_state")
+    root_pose = _root_pose(location, floating)
+    if root_pose is not None and not np.allclose(root_pose, frames.T_own_root, atol=1e-6):
+        notes.append(f"{location} places the robot elsewhere than the scene does; it is ignored")
     velocity = list_of("", mapping_of("start_state", state, "joint_state"), "velocity")
     if any(velocity):
         notes.append(
@@ -526,14 +560,15 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
         raise InputError("goal_constraints is empty; it must hold at least one goal")
     joint_goals = ()
     pose_goal = None
-    if len(goals) == 1 and goals[0][1].get("position_constraints"):
+    pose_fields = ("position_constraints", "orientation_constraints")
+    if len(goals) == 1 and any(map(goals[0][1].get, pose_fields)):
         pose_goal = _pose_goal(*goals[0], frames, notes)
     else:
-        joint_goals = tuple(_joint_goal(*goal) for goal in goals)
+        joint_goals = tuple(_joint_goal(*goal, notes) for goal in goals)
     return MoveItRequest(start, joint_goals, pose_goal, attached, tuple(notes))
 
 
-def _attached(location: str, entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> MoveItAttached:
+def _attached(location: str, entry: JsonObject, frames: MoveItFrames, folder: Path) -> MoveItAttached:
     link = str(entry.get("link_name") or "")
     location, object_entry = f"{location}.object", mapping_of(location, entry, "object")
     in_link = frame_name(location, object_entry) == link
@@ -545,17 +580,23 @@ def _attached(location: str, entry: dict[str, Any], frames: MoveItFrames, folder
     return MoveItAttached(str(object_entry.get("id") or "object"), link, shapes, in_link, touch)
 
 
-def _joint_goal(where: str, goal: dict[str, Any]) -> dict[str, float]:
+def _joint_goal(where: str, goal: JsonObject, notes: list[str]) -> dict[str, float]:
+    """Joint values by name. Notes on large tolerances are added to `notes`."""
     if any(goal.get(f"{kind}_constraints") for kind in ("position", "orientation", "visibility")):
         raise InputError(f"{where} must have joint_constraints alone; only a single goal may be a pose")
+    entries = mappings_of(f"{where}.", goal, "joint_constraints")
+    for at, entry in entries:
+        tolerances = numbers([entry.get(f"tolerance_{side}", 0) for side in ("above", "below")])
+        if tolerances is not None and tolerances.max() > WIDE_ANGLE:
+            notes.append(f"{at}: its tolerance of {tolerances.max():g} is ignored")
     return {
         str(entry.get("joint_name")): float(vector(at, "position", [entry.get("position")], 1)[0])
-        for at, entry in mappings_of(f"{where}.", goal, "joint_constraints")
+        for at, entry in entries
     }
 
 
-def _wide_tolerances(region: dict[str, Any], orientation: dict[str, Any]) -> list[str]:
-    """The tolerances of a pose goal that permit more than the validator does."""
+def _wide_tolerances(region: JsonObject, orientation: JsonObject) -> list[str]:
+    """Texts for dimensions of a goal's region above WIDE_REGION, and for tolerances above WIDE_ANGLE."""
     shapes = mappings_of("", region, "primitives")
     sizes = [size for _, shape in shapes for size in list_of("", shape, "dimensions")]
     angles = [orientation.get(f"absolute_{axis}_axis_tolerance", 0) for axis in "xyz"]
@@ -568,14 +609,13 @@ def _wide_tolerances(region: dict[str, Any], orientation: dict[str, Any]) -> lis
     return wide
 
 
-def _pose_goal(
-    where: str, goal: dict[str, Any], frames: MoveItFrames, notes: list[str]
-) -> tuple[str, ndarray]:
+def _pose_goal(where: str, goal: JsonObject, frames: MoveItFrames, notes: list[str]) -> tuple[str, ndarray]:
     """The link and its goal pose T_base_link. A note on large tolerances is added to `notes`."""
     positions, orientations = (
         mappings_of(f"{where}.", goal, f"{kind}_constraints") for kind in ("position", "orientation")
     )
-    if len(positions) != 1 or len(orientations) != 1 or goal.get("joint_constraints"):
+    others = any(goal.get(f"{kind}_constraints") for kind in ("joint", "visibility"))
+    if len(positions) != 1 or len(orientations) != 1 or others:
         raise InputError(f"{where} must have one position and one orientation constraint, and no others")
     [(at, position)], [(_, orientation)] = positions, orientations
     link = position.get("link_name")
@@ -583,8 +623,9 @@ def _pose_goal(
         raise InputError(
             f"{where} constrains {link} and {orientation.get('link_name')}; both must constrain one link"
         )
-    if xyz_of("target_point_offset", position.get("target_point_offset") or [0, 0, 0]).any():
-        raise InputError(f"{at}.target_point_offset must be zero")
+    offset = xyz_of("target_point_offset", position.get("target_point_offset") or [0, 0, 0])
+    if offset.any():
+        raise InputError(f"{at}.target_point_offset is {shown(offset)}; it must be zero")
     name = "constraint_region"
     region = mapping_of(at, position, name)
     poses = mappings_of(f"{name}.", region, "primitive_poses")

@@ -4,8 +4,8 @@ configurations, poses of one or several links with tolerances, or any of several
 The functions before the class `Problem` check its fields: they raise InputError for a wrong value, and most
 return the value that the problem stores.
 
-`no_type_check` keeps type checkers from checking the constructors at run time, since they check their
-arguments themselves (see scenes/shapes.py)."""
+The constructors check their arguments themselves, so `no_type_check` keeps type checkers from checking them
+at run time (see scenes/shapes.py)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
@@ -25,6 +25,7 @@ from robotdiffuse.core.errors import (
     check_type,
     counted,
     distinct,
+    located,
     numbers,
     repeated,
     rigid_motion,
@@ -51,9 +52,8 @@ from robotdiffuse.problems.constraints import CONSTRAINTS, CartesianLine, Constr
 from robotdiffuse.robots.bodies import Payload
 from robotdiffuse.robots.dynamics import check_dynamics
 from robotdiffuse.robots.kinematic_tree import Joint
-from robotdiffuse.robots.robot import Robot, check_robot, named_pose
-from robotdiffuse.scenes.moving_obstacles import MovingObstacle
-from robotdiffuse.scenes.scene import ALL_LINKS, Scene
+from robotdiffuse.robots.robot import Robot, check_robot, configurations, named_pose
+from robotdiffuse.scenes.scene import ALL_LINKS, MovingObstacle, Scene, added
 
 MAX_TURN = 3.2
 """Largest tolerance of an angle, a little more than half a turn [rad]; larger numbers can only be degrees."""
@@ -162,6 +162,7 @@ class PosesGoal(Value):
         if twice:
             raise InputError(f"goal.poses names {twice[0]!r} twice; each link has one pose")
         object.__setattr__(self, "poses", tuple(self.poses))
+        super().__post_init__()
 
     def moved(self, T: Pose) -> "PosesGoal":
         """Move all poses.
@@ -171,6 +172,9 @@ class PosesGoal(Value):
 
         Returns:
             The goal after the motion.
+
+        Raises:
+            InputError: Unless T is rigid.
         """
         return PosesGoal([pose.moved(T) for pose in self.poses])
 
@@ -183,8 +187,8 @@ class PosesGoal(Value):
 @no_type_check
 @frozen_dataclass
 class AnyGoal(Value):
-    """Several goals, any of which may be reached. The goals of an AnyGoal among them become goals of this
-    one."""
+    """Several goals, any of which may be reached. If one of the given goals is an AnyGoal, its own goals take
+    its place."""
 
     goals: "tuple[OneGoal, ...]"
     """At least one; `PlanResult.goal_index` counts them from 0."""
@@ -193,6 +197,7 @@ class AnyGoal(Value):
         types = "rd.JointGoal, rd.PoseGoal, rd.PosesGoal and rd.AnyGoal"
         check_list("goal.goals", self.goals, Goal, types, least=1)
         object.__setattr__(self, "goals", tuple(chain(*map(goals_of, self.goals))))
+        super().__post_init__()
 
     def moved(self, T: Pose) -> "AnyGoal":
         """Move all goals.
@@ -202,6 +207,9 @@ class AnyGoal(Value):
 
         Returns:
             The goals after the motion.
+
+        Raises:
+            InputError: Unless T is rigid, if any of the goals is a pose.
         """
         return AnyGoal(tuple(goal.moved(T) for goal in self.goals))
 
@@ -270,9 +278,9 @@ def blend_radii(value: object, count: int) -> tuple[float, ...]:
     blends = numbers(value)
     if blends is not None and blends.ndim == 0 and count:
         blends = np.full(count, blends)
-    has_blends = blends is not None and blends.size > 0
+    has_blends = blends is None or blends.size > 0
     if has_blends and not count:
-        raise InputError(f"blend is {shown(value)}; there are no waypoints")
+        raise InputError(f"blend is {shown(value)}; there are no waypoints: leave out blend, or give some")
     if (
         blends is None
         or (has_blends and blends.shape != (count,))
@@ -293,7 +301,7 @@ def check_contacts(robot: Robot, scene: Scene) -> None:
 
 
 def moving_obstacles(moving: Any, scene: Scene) -> tuple[MovingObstacle, ...]:
-    """The obstacles, renamed where a shape of the scene has the same name."""
+    """The obstacles, renamed where a shape of the scene or an earlier moving obstacle has the same name."""
     check_list("moving", moving, MovingObstacle, "rd.MovingObstacle")
     shapes = Scene([*scene.shapes, *(obstacle.shape for obstacle in moving)]).shapes[len(scene.shapes) :]
     return tuple(
@@ -303,7 +311,7 @@ def moving_obstacles(moving: Any, scene: Scene) -> tuple[MovingObstacle, ...]:
 
 
 def velocity_at_start(robot: Robot, value: object, notes: list[str]) -> JointValues | None:
-    """The start velocity; None if all its values are below MIN_RATE.
+    """The start velocity; None if the absolute values of all its numbers are below MIN_RATE.
 
     Values up to VELOCITY_SLACK beyond a limit are clamped to it, each with a note in `notes`.
     """
@@ -314,7 +322,7 @@ def velocity_at_start(robot: Robot, value: object, notes: list[str]) -> JointVal
     if velocity is None or velocity.shape != (robot.dof,) or not np.isfinite(velocity).all():
         raise InputError(
             f"start_velocity is {shown(value)}; it must be {counted(robot.dof, 'finite number')} "
-            f"[rad/s]: {names}"
+            f"[rad/s] or [m/s]: {names}"
         )
     within = np.clip(velocity, -robot.velocity, robot.velocity)
     for j in np.flatnonzero((velocity != within) & (robot.velocity > 0)):
@@ -323,7 +331,7 @@ def velocity_at_start(robot: Robot, value: object, notes: list[str]) -> JointVal
         if abs(velocity[j] - within[j]) > VELOCITY_SLACK * limit:
             velocity_text, _, limit_text = distinct(velocity[j], -limit, limit)
             raise InputError(f"start_velocity: {name} is {velocity_text}; its velocity limit is {limit_text}")
-        notes.append(f"start_velocity: {name} clamped from {velocity[j]!r} to its limit {within[j]!r}")
+        notes.append(f"start_velocity: {name} clamped from {velocity[j]} to its limit {within[j]}")
         velocity[j] = within[j]
     return velocity if (np.abs(velocity) >= MIN_RATE).any() else None
 
@@ -332,8 +340,12 @@ def checked_goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Go
     """The goal as one of the classes of `Goal`, with its configurations within the joint limits."""
     if isinstance(goal, list | tuple):
         goal = [_values(robot, f"{field}[{i}]", each) for i, each in enumerate(goal)]
-        if any(isinstance(each, OneGoal) for each in goal):
-            goal = AnyGoal(tuple(each if isinstance(each, OneGoal) else JointGoal(each) for each in goal))
+        if any(isinstance(each, Goal) for each in goal):
+            goals = list[Any]()
+            for i, each in enumerate(goal):
+                with located(f"{field}[{i}]"):
+                    goals.append(each if isinstance(each, Goal) else JointGoal(each))
+            goal = AnyGoal(tuple(goals))
     if isinstance(goal, AnyGoal):
         fields = (f"{field}.goals[{i}]" for i in range(len(goal.goals)))
         each = [
@@ -347,7 +359,9 @@ def checked_goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Go
     if isinstance(goal, PosesGoal):
         _check_independent_links(robot, field, goal)
         return goal
-    rows = goal.positions if isinstance(goal, JointGoal) else JointGoal(goal).positions  # type: ignore[arg-type]
+    with located(field):
+        goal = goal if isinstance(goal, JointGoal) else JointGoal(goal)  # type: ignore[arg-type]
+    rows = goal.positions
     fields = [field] if len(rows) == 1 else [f"{field}[{i}]" for i in range(len(rows))]
     return JointGoal(
         np.stack([checked_configuration(robot, *row, notes) for row in zip(fields, rows, strict=True)])
@@ -367,16 +381,19 @@ def _check_independent_links(robot: Robot, field: str, goal: PosesGoal) -> None:
 
 
 def _values(robot: Robot, field: str, value: Any) -> Any:
-    """The planned joint values for the name of a stored configuration of the robot (`robot.poses`) or for a
-    dict by joint; any other value is returned unchanged."""
+    """The planned joint values for the name of a stored configuration of the robot (`robot.poses`), for a
+    dict by joint, and for a series or a table of pandas with joints as labels or columns; any other value is
+    returned unchanged."""
     if isinstance(value, str):
         return named_pose(robot, field, value)
-    if not isinstance(value, Mapping):
-        return value
     joint_names = [joint.name for joint in robot.joints]
-    for name in value:
+    labels = list(value.keys()) if hasattr(value, "keys") else []
+    if not isinstance(value, Mapping) and not any(name in joint_names for name in labels):
+        return value
+    for name in labels:
         check_name(f"joint in {field}:", name, joint_names)
-    return robot.planned_values(field, value)
+    values = robot.planned_values(field, {name: value[name] for name in labels})
+    return values if isinstance(value, Mapping) else np.transpose(values)
 
 
 def configuration(robot: Robot, field: str, value: object) -> Configuration:
@@ -485,8 +502,8 @@ class Problem(Value):
 
     `start` accepts a configuration, a dict of values by joint (values of joints that are not planned are
     ignored), or the name of a pose of the robot (`robot.poses`), such as "ready". `goal` accepts these, a
-    list of configurations, a JointGoal, a PoseGoal, a PosesGoal, or a list of goals, any of which may be
-    reached. Each waypoint accepts what `goal` accepts.
+    list of configurations, a JointGoal, a PoseGoal, a PosesGoal, an AnyGoal, or a list of goals, any of which
+    may be reached. Each waypoint accepts what `goal` accepts.
 
     Values up to `LIMIT_SLACK` beyond a joint limit are clamped, with a note. Values of continuous joints are
     not changed: a goal may be reached any number of full turns away. Planners, not this class, detect
@@ -529,7 +546,8 @@ class Problem(Value):
     moving: tuple[MovingObstacle, ...] = ()
     """Moving obstacles; the motion begins at their time 0. `scene` holds the static obstacles."""
     start_velocity: JointValues | None = None
-    """Joint velocities at the start [rad/s] or [m/s]; None, or all below 1e-6: the motion starts at rest."""
+    """Joint velocities at the start [rad/s] or [m/s]; None, or absolute values all below 1e-6: the motion
+    starts at rest."""
     blend: tuple[float, ...] = ()
     """For each waypoint, the distance within which the motion may pass it without stopping; 0: the motion
     stops there. For a configuration it is the Euclidean distance in joint space [rad], for a pose the
@@ -539,8 +557,6 @@ class Problem(Value):
     """Load on a link. The timed motion then keeps the effort limits; None: effort limits are ignored."""
 
     def __post_init__(self) -> None:
-        if self.clearance is not None:
-            check_clearance(self.clearance)
         if self.unknown is not None:
             check_unknown("unknown", self.unknown)
         check_robot(self.robot)
@@ -550,6 +566,7 @@ class Problem(Value):
         notes = list(self.notes)
         T = self.T_world_base
         checked: dict[str, Any] = {
+            "clearance": None if self.clearance is None else check_clearance(self.clearance),
             "start": checked_configuration(self.robot, "start", self.start, notes),
             "goal": checked_goal(self.robot, "goal", self.goal, notes),
             "waypoints": waypoint_goals(self.robot, self.waypoints, notes),
@@ -566,11 +583,13 @@ class Problem(Value):
         if checked["views"]:
             from robotdiffuse.perception.seen_points import seen_shapes  # compiled code
 
-            goal = checked["goal"]
             known_scene = self.known_scene
-            goals = goal.positions if isinstance(goal, JointGoal) else checked["start"][None]
+            joint_goals = [
+                goal.positions for goal in goals_of(checked["goal"]) if isinstance(goal, JointGoal)
+            ]
+            goals = np.concatenate(joint_goals or [checked["start"][None]])
             seen = seen_shapes(checked["views"], self.robot, known_scene, checked["start"], goals)
-            checked["scene"] = known_scene.with_shapes([*known_scene.shapes, *seen])
+            checked["scene"] = added(known_scene, seen)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         super().__post_init__()
@@ -660,10 +679,9 @@ class Problem(Value):
             1 m, or at 0.3 m in scenes with point clouds or meshes.
 
         Raises:
-            InputError: For q of the wrong shape.
+            InputError: For q of the wrong shape, and numbers that are not finite or beyond ±1e4.
         """
         from robotdiffuse.collision import CollisionChecker  # compiled code
-        from robotdiffuse.robots.robot import configurations
 
         rows = configurations(self.robot, q)
         checker = CollisionChecker(self.robot, self.scene)
@@ -685,7 +703,7 @@ class Problem(Value):
             why not.
 
         Raises:
-            InputError: For q of the wrong shape, and for an unknown name.
+            InputError: For q of the wrong shape, an unknown name, and values that lack a planned joint.
 
         Examples:
             >>> scene = rd.Scene([rd.Sphere([0.5, 0, 0.5], 0.2)])
@@ -741,12 +759,13 @@ def check_unknown(field: str, value: object) -> str:
     return str(value)
 
 
+def is_given(value: object) -> bool:
+    """Whether the value of a field of a problem was given: neither None nor an empty tuple."""
+    return not (value is None or (isinstance(value, tuple) and not value))
+
+
 def _check_combinations(checked: dict[str, Any]) -> None:
-    given_fields = {
-        name
-        for name, value in checked.items()
-        if not (value is None or (isinstance(value, tuple) and not value))
-    }
+    given_fields = {name for name, value in checked.items() if is_given(value)}
     if not any(checked["blend"]):
         given_fields.discard("blend")
     if any(isinstance(constraint, CartesianLine) for constraint in checked["constraints"]):
@@ -760,4 +779,4 @@ def moved(value: Any, T: Pose) -> Any:
     """The value, or each item of a list, after the rigid motion T. A value without a pose is not changed."""
     if isinstance(value, list | tuple):
         return [moved(item, T) for item in value]
-    return value.moved(T) if hasattr(value, "moved") else value
+    return value.moved(T) if hasattr(value, "moved") and not isinstance(value, type) else value

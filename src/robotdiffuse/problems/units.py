@@ -27,8 +27,8 @@ ADVICE = "lengths are in meters: divide millimeters by 1000"
 
 def unit_notes(problem: Problem) -> tuple[str, ...]:
     """Notes on obstacles and views that may be in millimeters: one on each that is too large (for views, also
-    too far away). If there is none, and no view or moving obstacle, one on all obstacles if none is in
-    reach."""
+    too far away), or, for views, whose intrinsics may be those of an image of another size. If there is no
+    such note, no view and no moving obstacle: one on all obstacles if none is in reach."""
     reach = reach_bound(problem.robot)
     obstacles = [
         shape for shape in problem.scene.shapes if not isinstance(shape, (SeenPoints, AssumedPoints))
@@ -73,8 +73,7 @@ def arm_in_cloud_note(robot: Robot, scene: Scene, q: Configuration) -> str:
 
 
 def _size_note(shape: Shape, extents: Vector) -> str:
-    scanned = isinstance(shape, Mesh | PointCloud)
-    if (extents.max() if scanned else extents.min()) <= MAX_EXTENT:
+    if (extents.max() if isinstance(shape, Mesh | PointCloud) else extents.min()) <= MAX_EXTENT:
         return ""
     return f"check the units: {shape.name} is {extents.max():.4g} m long; {ADVICE}"
 

@@ -307,13 +307,10 @@ HAND = PANDA.fk(Q, "panda_hand")[:3, 3]
 PROBLEM = rd.Problem(PANDA, rd.Scene([rd.Sphere(HAND, 0.05, "ball")]), "ready", "extended")
 
 
-def test_a_free_configuration_is_true_without_a_reason() -> None:
+def test_the_reason_names_links_and_obstacle_or_the_limit_and_a_wrong_shape_is_an_error() -> None:
     for q in ("ready", PANDA.poses["ready"].values(), Q * [-1, 1, 1, 1, 1, 1, 1] + [1, 0, 0, 0, 0, 0, 0]):
         state = PROBLEM.is_free(q if isinstance(q, str) else list(q))
         assert state and state.reason == "" and state.links == ()
-
-
-def test_the_reason_names_links_and_obstacle_or_the_limit_and_a_wrong_shape_is_an_error() -> None:
     state = PROBLEM.is_free(Q)
     assert not state and state.reason.startswith("panda_hand is ") and state.reason.endswith("inside ball")
     assert state.links[0] == "panda_hand"
@@ -364,7 +361,7 @@ def _notes(*shapes: rd.Box | rd.Mesh | rd.PointCloud | rd.Sphere, **options: obj
     return unit_notes(rd.Problem(PANDA, rd.Scene(shapes), HOME, TO, **options))  # type: ignore[arg-type]
 
 
-def test_obstacles_in_millimeters_are_noted() -> None:
+def test_obstacles_in_millimeters_are_noted_and_those_in_meters_are_not() -> None:
     for shape, text in (
         (rd.Mesh(200 * CUBE + [500, 300, 600], FACES), "mesh is 200 m long"),
         (rd.PointCloud(1600 * CUBE - 800), "point_cloud is 1600 m long"),
@@ -372,9 +369,6 @@ def test_obstacles_in_millimeters_are_noted() -> None:
     ):
         [note] = _notes(shape)
         assert note.startswith("check the units") and text in note and "millimeters" in note
-
-
-def test_scenes_in_meters_have_no_notes_on_units() -> None:
     floor = rd.Box([0, 0, -0.6], [30, 30, 1], name="floor")
     assert _notes() == _notes(floor) == _notes(rd.Sphere([0.5, 0.3, 0.6], 0.1), rd.Sphere([0, 9, 0], 0.1)) == ()
     assert _notes(rd.PointCloud(CUBE), rd.PointCloud(np.zeros((0, 3)))) == ()
@@ -382,17 +376,14 @@ def test_scenes_in_meters_have_no_notes_on_units() -> None:
     assert "the obstacle ball is beyond" in note, "it named the empty cloud"
 
 
-def test_a_depth_image_in_millimeters_is_noted() -> None:
+def test_depths_in_millimeters_and_intrinsics_of_another_size_are_noted() -> None:
     assert _notes(views=[seen()]) == ()
     wrong = [rd.DepthView(1000 * seen().depth, seen().intrinsics, seen().T_base_camera)]
     [note] = _notes(views=wrong)
     assert "depths of views[0] begin at" in note and "millimeters" in note
     problem = rd.Problem(PANDA, rd.Scene(), HOME, TO, views=wrong, unknown="padded")
     assert rd.load_planner("aorrtc").plan(problem).notes.count(note) == 1
-
-
-def test_intrinsics_for_images_of_another_size_are_noted() -> None:
-    """Regression: without the arm in the image, nothing told that intrinsics were those before the image was resized."""
+    # Regression: without the arm in the image, nothing told that intrinsics were those before the image was resized.
     for factor in (0.5, 2.0):
         [note] = _notes(views=[replace(seen(), intrinsics=tuple(factor * np.array(seen().intrinsics)))])
         assert note.startswith("check the intrinsics of views[0]: cx and cy") and "(60, 80) pixels" in note
@@ -528,6 +519,25 @@ def test_wrong_equipment_is_one_line(extra: dict[str, Any], message: str, tmp_pa
     refuses(message, rd.load_problem, written(tmp_path, PLAIN | extra))
 
 
+def test_a_robot_may_have_the_name_of_a_file() -> None:
+    """Regression: a KeyError for robots of a server that were loaded from files."""
+    assert problem_from_record(PLAIN | {"robot": "arm.urdf"}, {"arm.urdf": PANDA}).robot is PANDA
+
+
 def test_a_second_shape_of_one_name_is_noted(tmp_path: Path) -> None:
     problem = rd.load_problem(written(tmp_path, PLAIN | {"scene": [WALL, WALL]}))
     assert problem.notes == ("scene[1]: an earlier shape is named wall too; this one is wall_2",)
+
+
+def test_holes_tools_on_held_objects_and_lines_without_an_end_are_saved_and_read_again(tmp_path: Path) -> None:
+    """Regressions: NaN is no JSON; the tool was read before the object that holds it; two problems were on one line."""
+    terrain = rd.HeightMap([[0, 0, 0], [0, 0, np.nan]], 0.1, [0.5, 0.5, -0.2])
+    robot = PANDA.attach(rd.Sphere([0, 0, 0.12], 0.02, name="gripper"), "panda_hand").with_tool("gripper", rd.pose([0, 0, 0.1]))
+    problem = rd.Problem(robot, rd.Scene([terrain]), "ready", "extended")
+    file = tmp_path / "problems.jsonl"
+    save_problem(problem, file)
+    file.write_text(file.read_text().rstrip())
+    save_problem(problem, file)
+    for case in load_problems(file):
+        assert [body.name for body in case.load().robot.attached] == ["gripper", "tool"]
+        np.testing.assert_array_equal(case.load().scene.shapes[0].heights, terrain.heights)  # type: ignore[attr-defined]

@@ -5,15 +5,15 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Positive, Settings
+from robotdiffuse.core.settings import Natural, Positive, Settings
 from robotdiffuse.core.transforms import moved_spheres
-from robotdiffuse.core.types import Configuration, Configurations, JointRows, Pose
+from robotdiffuse.core.types import Configuration, Configurations, JointRows, Mask, Pose
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.robot import Robot
@@ -24,6 +24,7 @@ Spheres = Float[ndarray, "_ 4"]
 """x, y, z, radius [m]."""
 Range = tuple[float, float]
 PositiveRange = tuple[Positive, Positive]
+NaturalRange = tuple[Natural, Natural]
 """A range that is sampled uniformly; equal bounds fix the value."""
 
 
@@ -183,7 +184,7 @@ def reaching_configurations(
     would be far more frequent than others.
     """
 
-    def accept(q: Configurations) -> Bool[ndarray, "n"]:
+    def accept(q: Configurations) -> Mask:
         inside = ((q > robot.lower + LIMIT_MARGIN) & (q < robot.upper - LIMIT_MARGIN)).all(axis=1)
         return inside & checker.free(q)
 

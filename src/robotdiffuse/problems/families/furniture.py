@@ -1,5 +1,5 @@
-"""Furniture: base class of the families (generators of random problems) with shelves, crates and tables
-around an arm that stands on the ground.
+"""Families (generators of random problems) with furniture around an arm that stands on the ground: shelves,
+crates, tables, kitchens and cabinets; `Furniture` is their base class.
 
 All shapes are spheres, and boxes rotated about the vertical axis, so that data sets can store these scenes in
 the same arrays as those of the family `rop`. Each scene has regions in which the arm works: in compartments,
@@ -8,7 +8,7 @@ in crates and between the objects on a table. `sample_target` samples poses with
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Annotated
 
@@ -22,6 +22,7 @@ from robotdiffuse.core.transforms import rotation_about, rotation_z_to, transfor
 from robotdiffuse.core.types import Pose, Values, Vector
 from robotdiffuse.problems.families.family import (
     CONFIGURATION,
+    NaturalRange,
     PositiveRange,
     Range,
     Ranges,
@@ -54,7 +55,8 @@ MAX_TRIES = 1000
 PLACE_TRIES = 30
 """If this many samples of a place for an object are all occupied, the scene is sampled anew."""
 MIN_GAP = 0.01
-"""Minimum distance between the objects on a table or on the ground [m]."""
+"""Minimum distance between the objects on a table, a counter or the ground, and between a loose object and
+the board above it [m]."""
 # Minimum free height beneath tables with a region there, and height of counters with a region inside [m].
 MIN_TABLE_HEIGHT = 0.3
 MIN_COUNTER_HEIGHT = 0.25
@@ -82,7 +84,7 @@ class Region:
     yaw: float
     """Rotation of the box about the vertical axis [rad]."""
     approach: Vector
-    """Unit vector of the hand's direction, in the base frame: into a compartment, or down into a crate."""
+    """Unit vector of the hand's direction, in the base frame: away from the arm, or down."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +123,7 @@ class Furniture(Ranges, ABC):
     """Rotation of the furniture about the vertical axis; 0 faces the base [rad]."""
     reach: Positive = 0.8
     """Maximum distance of the centers of regions from the shoulder; other regions are left out [m]."""
-    objects: tuple[Natural, Natural] = (0, 4)
+    objects: NaturalRange = (0, 4)
     """Minimum and maximum number of loose objects."""
     object_width: PositiveRange = (0.05, 0.12)
     """Horizontal edge lengths of a loose box, or diameter of a ball [m]."""
@@ -214,6 +216,8 @@ class FurnitureFrame:
     def box(self, low: Corner, high: Corner, name: str, turn: float = 0.0) -> None:
         """Adds a box. `low` and `high` are opposite corners in this frame, before the box is rotated by
         `turn` about the vertical axis through its middle [rad]."""
+        if np.less_equal(high, low).any():  # boards that are thicker than the space for them
+            raise NoRoomError
         half = (self.yaw + turn) / 2
         place = self._place(low, high)
         self.shapes.append(Box(*place, (np.cos(half), 0.0, 0.0, np.sin(half)), name))
@@ -263,25 +267,32 @@ class LooseObject:
 
 
 Rectangle = tuple[float, float, float, float]
-"""A rectangle on a surface: x, y of the middle, half edges."""
+"""A rectangle on a surface: x and y of the middle, and half the edges along x and y [m]."""
+
+
+def _check_exclusive(settings: Furniture, *names: str) -> None:
+    """Raise InputError if two shares of which at most one applies sum to more than 1."""
+    first, second = (getattr(settings, name) for name in names)
+    if first + second > 1:
+        raise InputError(f"{names[0]} is {first} and {names[1]} {second}; together they must be at most 1")
 
 
 class NoRoomError(Exception):
-    """No free place for an object was found: the scene is sampled anew."""
+    """An object has no free place, or a board no space: the scene is sampled anew."""
 
 
+@dataclass(eq=False)
 class Surface:
     """The top of a table or a counter, with the places on it that are taken.
 
     In the furniture's frame it extends over x from 0 to `length`, y from -`side` to `side` [m].
     """
 
-    def __init__(self, frame: FurnitureFrame, length: float, side: float, height: float) -> None:
-        self.frame = frame
-        self.length = length
-        self.side = side
-        self.height = height
-        self.taken: list[Rectangle] = []
+    frame: FurnitureFrame
+    length: float
+    side: float
+    height: float
+    taken: list[Rectangle] = field(default_factory=list)
 
     def place(self, half_x: float, half_y: float, rng: Generator) -> tuple[float, float]:
         """The middle of a free rectangle, which is then marked as taken. Raises NoRoomError."""
@@ -325,7 +336,7 @@ def loose_in_cells(
     at_sides: bool = False,
 ) -> None:
     """Adds random loose objects, at most one per cell (see `Cell`). Objects that would take more than two
-    thirds of a cell's width are left out.
+    thirds of a cell's width are left out, and so are objects in cells at most MIN_GAP high.
 
     Each cell with an object is narrowed to the wider free part beside the object. depth: of the cells [m].
     at_sides: whether objects stand at the left or right side of a cell, instead of anywhere.
@@ -335,7 +346,7 @@ def loose_in_cells(
         low, high, z, ceiling = cells[i]
         loose = LooseObject(settings, rng, ceiling - z - MIN_GAP)
         half = loose.half
-        if 3 * half > high - low:
+        if 3 * half > high - low or loose.size[2] <= 0:
             continue
         x = rng.uniform(min(half, depth / 2), max(depth - half, depth / 2))
         if at_sides:
@@ -352,7 +363,8 @@ def edges(sizes: Values, t: float) -> Values:
 
 
 def centered(widths: Values, t: float) -> Values:
-    """As `edges`, centered: y of the right sides of uprights, separated by gaps of these widths."""
+    """Positions along y of the right sides of uprights, separated by gaps of these widths, with their middle
+    at 0; see `edges`."""
     sides = edges(widths, t)
     return sides - (sides[-1] + t) / 2
 
@@ -442,7 +454,7 @@ class Crate(Furniture):
     raised_share: Share = 0.4
     """Fraction of the crates that stand on a block."""
     block_height: PositiveRange = (0.05, 0.3)
-    spots: tuple[Natural, Natural] = (1, 2)
+    spots: NaturalRange = (1, 2)
     """Number of free spots on the ground."""
     spot_size: PositiveRange = (0.12, 0.2)
 
@@ -503,7 +515,7 @@ class Table(Furniture):
     legs, where it points forward.
     """
 
-    objects: tuple[Natural, Natural] = (3, 10)
+    objects: NaturalRange = (3, 10)
     object_height: PositiveRange = (0.08, 0.35)
     distance: PositiveRange = (0.25, 0.4)
     """Distance from the base to the middle of the near edge of the table."""
@@ -524,16 +536,12 @@ class Table(Furniture):
     divider_height: PositiveRange = (0.25, 0.6)
     """Height of walls and pillars."""
     pillar_width: PositiveRange = (0.06, 0.12)
-    spots: tuple[Natural, Natural] = (2, 4)
+    spots: NaturalRange = (2, 4)
     spot_size: PositiveRange = (0.12, 0.2)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.wall_share + self.pillar_share > 1:
-            raise InputError(
-                f"wall_share is {self.wall_share} and pillar_share {self.pillar_share}; "
-                "together they must be at most 1"
-            )
+        _check_exclusive(self, "wall_share", "pillar_share")
 
     @property
     def max_obstacles(self) -> int:
@@ -597,7 +605,7 @@ class Kitchen(Furniture):
     reach: Positive = 0.85
     """Larger than the default: a hand that points forward reaches farther than one that points
     down."""
-    objects: tuple[Natural, Natural] = (1, 5)
+    objects: NaturalRange = (1, 5)
     distance: PositiveRange = (0.3, 0.45)
     """Distance from the base to the middle of the near edge of the counter."""
     height: PositiveRange = (0.05, 0.4)
@@ -608,23 +616,23 @@ class Kitchen(Furniture):
     """Thickness of all boards and walls."""
     open_share: Share = 0.6
     """Fraction of the sufficiently high counters that are open in front."""
-    ovens: tuple[Natural, Natural] = (0, 2)
-    solids: tuple[Natural, Natural] = (0, 2)
+    ovens: NaturalRange = (0, 2)
+    solids: NaturalRange = (0, 2)
     """Number of solid appliances."""
     appliance_width: PositiveRange = (0.3, 0.45)
     """Width of ovens. The width of a solid appliance is between half of this and all of it."""
     appliance_depth: PositiveRange = (0.22, 0.38)
     appliance_height: PositiveRange = (0.22, 0.36)
-    cupboards: tuple[Natural, Natural] = (0, 3)
+    cupboards: NaturalRange = (0, 3)
     """Number of cupboards, which hang side by side in the middle of the wall."""
     cupboard_width: PositiveRange = (0.28, 0.45)
     cupboard_depth: PositiveRange = (0.2, 0.33)
     cupboard_height: PositiveRange = (0.26, 0.4)
     above: PositiveRange = (0.38, 0.55)
-    """Height of the cupboards above the counter."""
+    """Free height between the counter and the cupboards."""
     door_share: Share = 0.3
     """Fraction of the cupboards with a door, which is open."""
-    spots: tuple[Natural, Natural] = (1, 2)
+    spots: NaturalRange = (1, 2)
     spot_size: PositiveRange = (0.12, 0.2)
 
     @property
@@ -696,15 +704,16 @@ class Cabinet(Furniture):
     """A grid of cells between thin or thick boards, from a desk to a tall bookcase. Lengths in [m].
 
     A cell is open, has a door (shut, or open at any angle), or has a drawer that is pulled out. The cabinet
-    stands on the ground or on legs, or hangs. Regions are the open cells, the insides of drawers, and the
-    spaces above and below the cabinet. The hand points down into drawers, and forward elsewhere.
+    stands on the ground or on legs, or hangs. Regions are the cells without a drawer or a shut door, the
+    insides of drawers, and the spaces above and below the cabinet. The hand points down into drawers, and
+    forward elsewhere.
     """
 
     turn: Range = (-0.5, 0.5)
     reach: Positive = 0.85
     object_width: PositiveRange = (0.03, 0.14)
     object_height: PositiveRange = (0.03, 0.35)
-    objects: tuple[Natural, Natural] = (0, 6)
+    objects: NaturalRange = (0, 6)
     distance: PositiveRange = (0.35, 0.65)
     """Distance from the base to the middle of the front."""
     lowest: tuple[NotNegative, NotNegative] = (0.0, 0.7)
@@ -737,6 +746,10 @@ class Cabinet(Furniture):
     pulled: PositiveRange = (0.3, 0.95)
     """How far a drawer is pulled out, as a fraction of the depth."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_exclusive(self, "drawer_share", "door_share")
+
     @property
     def max_obstacles(self) -> int:
         boards = self.rows[1] + 1
@@ -767,8 +780,7 @@ class Cabinet(Furniture):
             for x in (0.0, depth - w):
                 for y in (left, right - w):
                     frame.box((x, y, 0.0), (x + w, y + w, low), "leg")
-        if low > MIN_OPENING:
-            regions.append(((0.0, left + 2 * t, 0.0), (depth / 2, right - 2 * t, low), AHEAD))
+        regions.append(((0.0, left + 2 * t, 0.0), (depth / 2, right - 2 * t, low), AHEAD))
         if len(boards) == len(tops):
             regions.append(((0.0, left, height), (depth, right, height + TOP_HEIGHT), AHEAD))
         cells = [
@@ -785,7 +797,7 @@ class Cabinet(Furniture):
                 regions.append((*self._drawer(frame, cell, depth, t, rng), DOWN))
             elif kinds[i] > 1 - self.door_share:
                 shut = rng.random() < self.shut_share
-                angle = 0.0 if shut else rng.uniform(self.door_angle[0], max_angle)
+                angle = 0.0 if shut else rng.uniform(min(self.door_angle[0], max_angle), max_angle)
                 _door(frame, cell, t, angle, rng.random() < 0.5)
                 free += [] if shut else [[*cell]]
             else:

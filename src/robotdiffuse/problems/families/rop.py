@@ -10,12 +10,13 @@ from numpy.random import Generator
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Natural, OneOf
+from robotdiffuse.core.settings import OneOf
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.problems.families.family import (
     CONFIGURATION,
     POSITION,
     POSITION_IK,
+    NaturalRange,
     PositiveRange,
     Range,
     Ranges,
@@ -46,7 +47,7 @@ class Rop(Ranges):
     Every range is sampled uniformly; equal bounds fix the value. Lengths in [m], in the robot's base frame.
     """
 
-    obstacles: tuple[Natural, Natural] = (2, 2)
+    obstacles: NaturalRange = (2, 2)
     """Minimum and maximum number of obstacles, inclusive."""
     kinds: tuple[Annotated[str, OneOf(KINDS)], ...] = KINDS
     """Kinds of obstacles to choose from: sphere, box (a cube)."""
@@ -95,7 +96,10 @@ class Rop(Ranges):
             shape = self._obstacle(rng)
             if is_clear_of(shape, keep_out):
                 return shape
-        raise InputError(f"no obstacle stays clear of the robot's base in {MAX_TRIES} samples; widen x, y, z")
+        raise InputError(
+            f"x is {self.x}, y {self.y} and z {self.z}; no obstacle stays clear of the robot's base in "
+            f"{MAX_TRIES} samples: widen these ranges"
+        )
 
     def _obstacle(self, rng: Generator) -> Sphere | Box:
         kind = self.kinds[int(rng.integers(len(self.kinds)))]

@@ -15,7 +15,7 @@ import robotdiffuse as rd
 from helpers.made_arms import joint, link, read_urdf, written
 from helpers.panda import PANDA
 from helpers.refusals import refuses
-from robotdiffuse.core.input_files import read_yaml
+from robotdiffuse.core.files import read_yaml
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_about, rotation_from_quaternion, transform
 from robotdiffuse.problems import moveit
 from robotdiffuse.problems.files import ProblemEntry, load_motion_bench_maker, load_problems, problem_record
@@ -152,6 +152,7 @@ WRONG_SCENES: dict[str, tuple[object, str]] = {
         r"ball: primitive_poses\[0\].orientation .* must not be zero",
     ),
     "frame": (scene_data(**ball(header={"frame_id": "moon"})), "header: 'moon'; known: panda_link0, world"),
+    "removed": (scene_data(**ball(operation=1)), r"operation is 1; only objects that are added \(0\) or appended \(2\) can be"),
     "plane": (scene_data(**ball(planes=[{"coef": [0, 0, 0, 1]}])), "must not all be zero"),
     "planes": (scene_data(**ball(planes=[{"coef": [0, 0, 1, 1]}] * 2000)), "2,000 planes; at most 1,000"),
     "package": (
@@ -354,6 +355,10 @@ def test_objects_are_held_at_the_start(frame: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(rod.T_link_body, T_hand_rod, atol=1e-9)
     T_world = problem_record(problem)["attached"][0]["cylinder"]  # type: ignore[index]
     np.testing.assert_allclose(T_world["center"], [0, 0, 0.2], atol=1e-9)
+    for several in ("primitives", "primitive_poses"):  # Regression: of two shapes, files held only the first
+        held["object"][several] *= 2  # type: ignore[index]
+    problem = asked(tmp_path, change(request_data(), ["start_state", "attached_collision_objects"], [held])).load()
+    refuses("rod has the shapes .*; a problem file holds only shapes of scenes, and exactly one", problem_record, problem)
 
 
 def pose_request(path: list[Any], value: object) -> dict[str, Any]:
@@ -361,15 +366,15 @@ def pose_request(path: list[Any], value: object) -> dict[str, Any]:
 
 
 def test_scaling_factors_padding_and_the_velocity_of_a_start_state_are_noted() -> None:
-    asked = {"max_velocity_scaling_factor": 0.1, "max_acceleration_scaling_factor": 1.0}
-    data: dict[str, Any] = request_data() | asked
+    data: dict[str, Any] = request_data() | {"max_velocity_scaling_factor": 0.1, "max_acceleration_scaling_factor": 1.0}
     data["start_state"]["joint_state"]["velocity"] = [0.0, 0.3]
     assert {*moveit.moveit_request(data, moveit.moveit_frames({}, PANDA)).notes} == {
         "the request's max_velocity_scaling_factor 0.1 is ignored: plan with velocity_scaling=0.1",
         "start_state.joint_state.velocity [0.0, 0.3] is ignored: the motion begins at rest",
     }
     padded = [{"link_name": "panda_hand", "padding": 0.02}, {"link_name": "b", "padding": 0.0}]
-    assert moveit.scene_robot_notes({"link_padding": padded}, PANDA) == ("the scene's link_padding of panda_hand is ignored",)
+    [change, ignored] = moveit.scene_robot_notes({"link_padding": padded, "is_diff": True}, PANDA)
+    assert "is a difference (is_diff)" in change and ignored == "the scene's link_padding of panda_hand is ignored"
 
 
 def test_wrong_requests() -> None:
@@ -478,8 +483,7 @@ def test_scene_in_a_frame_that_the_robot_is_placed_in(tmp_path: Path) -> None:
     """In `odom`, in which multi_dof_joint_state places the root; `world` is then unknown."""
     robot = mounted(tmp_path, "fixed")
     base_in_root = np.array([1, 2, 0.8])
-    turn = rotation_about(Z, np.pi / 2).T
-    expected = (turn @ (-np.array([3.0, 0, 0]) - base_in_root)).round(9).tolist()
+    expected = (rotation_about(Z, np.pi / 2).T @ (-np.array([3.0, 0, 0]) - base_in_root)).round(9).tolist()
     for frame in ("odom", "/odom", ""):
         assert place(at(frame, **state("odom", [3, 0, 0])), robot) == expected
     refuses(r"unknown frame_id of header: 'world'; known: odom, panda_link0", place, at("world", **state("odom", [3, 0, 0])))
@@ -500,3 +504,26 @@ def test_links_of_the_robot_are_frames_where_they_stand(tmp_path: Path) -> None:
     fixed = {"transform": {"translation": [9, 9, 9], "rotation": [0, 0, 0, 1]}, "child_frame_id": "stand"}
     assert place(at("stand", fixed_frame_transforms=[fixed]), robot) == [0, 0, -0.3]  # files cannot move links
     refuses(r"unknown frame_id of header: 'arm'; known: base, camera, map", place, at("arm"), robot)
+
+
+def test_contacts_of_an_object_of_several_parts_are_not_those_of_another() -> None:
+    """Regression: the second part of `a` was renamed `a_2`, and the object a_2 could be touched like it."""
+    two = {key: ball()[key] * 2 for key in ("primitives", "primitive_poses")}
+    data = {"world": {"collision_objects": [ball(id="a", **two), ball(id="a_2")]}}
+    scene = moveit.moveit_scene(data, moveit.moveit_frames(data, PANDA), Path(), PANDA.link_names, {"a": ["panda_hand"]})
+    assert [name for name, _ in scene.allowed_contacts] == ["a", "a_2"]  # the object a_2 is now a_2_2
+
+
+def test_what_a_request_leaves_out_or_asks_in_vain(tmp_path: Path) -> None:
+    """Regressions: fingers were not where the scene has them; tolerances and held objects without shapes were dropped."""
+    start = asked(tmp_path, request_data()).load().start
+    joints = request_data()["start_state"]["joint_state"]
+    (tmp_path / "scene0001.yaml").write_text(yaml.safe_dump(change(scene_data(), ["robot_state"], {"joint_state": joints})))
+    data = request_data() | {"start_state": {"is_diff": True}}
+    (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(data))
+    np.testing.assert_array_equal(load_motion_bench_maker(tmp_path, PANDA)[0].load().start, start)
+    data = request_data()
+    data["goal_constraints"][0]["joint_constraints"][2]["tolerance_above"] = 1.5
+    data["start_state"]["attached_collision_objects"] = [{"link_name": "panda_hand", "object": {"id": "cup"}}]
+    cup, tolerance = moveit.moveit_request(data, moveit.moveit_frames({}, PANDA)).notes
+    assert tolerance.endswith("its tolerance of 1.5 is ignored") and "panda_hand holds, has no shapes" in cup
