@@ -7,7 +7,7 @@ import robotdiffuse as rd
 from helpers.example_robots import planar_arm
 from helpers.panda import LEFT, PANDA, RIGHT
 from helpers.refusals import refuses
-from robotdiffuse.baselines import controls, straight_line
+from robotdiffuse.baselines import controls
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.exported_model import exported_model
 
@@ -59,8 +59,7 @@ MIDDLE = 0.5 * (PANDA.lower + PANDA.upper)
 def test_smooth_noise_has_the_covariance_of_the_pandas_weights_and_keeps_ends_and_limits() -> None:
     rng = np.random.default_rng(1)
     q = controls.smooth_noise(MIDDLE, MIDDLE[None], 4000, 48, PANDA, rng) - MIDDLE
-    half = np.minimum(0.5 * (PANDA.upper - PANDA.lower), controls.MAX_HALF_RANGE)
-    rows = np.moveaxis(q / half, 1, 2).reshape(-1, 48)
+    rows = np.moveaxis(q / np.minimum(0.5 * (PANDA.upper - PANDA.lower), controls.MAX_HALF_RANGE), 1, 2).reshape(-1, 48)
     assert abs(rows.std() - controls.SPREAD) < 0.005
     factor = exported_model("model", None, PANDA).statistics.noise_factor.astype(np.float64)
     shares = [np.linalg.eigvalsh(c)[::-1] / np.trace(c) for c in (rows.T @ rows, factor @ factor.T)]
@@ -75,9 +74,13 @@ def test_smooth_noise_has_the_covariance_of_the_pandas_weights_and_keeps_ends_an
 def test_any_goal_is_tried_where_the_nearest_is_blocked() -> None:
     free = np.append(2.8, RIGHT[1:])
     problem = rd.Problem(PANDA, WALL, LEFT, rd.JointGoal([RIGHT, free]))
-    found = straight_line.StraightLine().plan(problem, 5.0)
+    found = controls.StraightLine().plan(problem, 5.0)
     assert found.solved
     np.testing.assert_array_equal(found.path.positions, [LEFT, free])
-    alone = straight_line.StraightLine(straight_line.StraightLineSettings(goals=straight_line.NEAREST)).plan(problem, 5.0)
+    alone = controls.StraightLine(controls.StraightLineSettings(goals=controls.NEAREST_GOAL)).plan(problem, 5.0)
     assert not alone.solved and alone.refused == "scene_collision"
     assert "the straight line is refused" in alone.reason
+
+
+def test_vias_are_for_a_panda_with_all_joints() -> None:
+    refuses("only the panda", controls.fixed_vias, rd.load_robot("panda", locked={"panda_joint3": 0.0}))

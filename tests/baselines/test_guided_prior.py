@@ -69,8 +69,7 @@ def data_of(count: int, waypoints: int = WAYPOINTS) -> TrajectoryData:
     rng = np.random.default_rng(1)
     t = np.linspace(0, 1, waypoints)[:, None]
     middle = (PANDA.lower + PANDA.upper) / 2
-    half = (PANDA.upper - PANDA.lower) / 2
-    ends = middle + half * rng.uniform(-0.6, 0.6, (2, count, 1, PANDA.dof))
+    ends = middle + (PANDA.upper - PANDA.lower) * rng.uniform(-0.3, 0.3, (2, count, 1, PANDA.dof))
     q = (1 - t) * ends[0] + t * ends[1] + 0.3 * np.sin(np.pi * t) * rng.normal(size=(count, 1, PANDA.dof))
     scenes = PackedScenes.pack([Scene([BALL])] * count, 1)
     return TrajectoryData(q.astype(np.float32), scenes, np.arange(count) % 3 == 0, None, "x", 0)
@@ -240,8 +239,7 @@ def test_the_same_seed_gives_the_same_path(planner: guided_prior.MPD | guided_pr
 
 
 def test_failure_says_what_was_wrong(planner, monkeypatch):
-    drawn = lines(planner.settings.samples)
-    monkeypatch.setattr(guided_prior, "sample", lambda *_arguments: drawn)
+    monkeypatch.setattr(guided_prior, "sample", lambda *_arguments: lines(planner.settings.samples))
     planner.plan(PROBLEM, time_limit=0.1)  # compiles and loads
     result = planner.plan(PROBLEM, time_limit=0.5)
     assert result.status is Status.TIMEOUT and result.path is None

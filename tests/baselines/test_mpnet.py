@@ -107,8 +107,7 @@ def test_waypoints_are_a_step_apart_or_the_goal() -> None:
     at_goal = (following == goal).all(1)
     assert len(here) == len(data) * SMALL.waypoints and 0 < at_goal.mean() < 0.7
     assert (np.abs(moved[~at_goal] - 0.5) < 0.06).all() and (moved < 0.56).all() and (moved > 0).all()
-    start_goal = np.concatenate([data.q[:, 0], data.q[:, -1]])
-    to_the_end = (goal[:, None] == start_goal).all(2).any(1).mean()
+    to_the_end = (goal[:, None] == np.concatenate([data.q[:, 0], data.q[:, -1]])).all(2).any(1).mean()
     assert 0.4 < to_the_end < 0.8, "half have sub-goals"
 
 
@@ -251,8 +250,7 @@ def test_loss_falls_on_few_motions() -> None:
 
 
 def test_a_path_in_collision_is_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
-    straight = Straight(RANGES, TINY)
-    monkeypatch.setattr(MPiNets, "network", lambda _self, _robot: straight)
+    monkeypatch.setattr(MPiNets, "network", lambda _self, _robot: Straight(RANGES, TINY))
     problem = Problem(PANDA, Scene([Box(BARRIER[:3], BARRIER[3:6])]), LEFT, RIGHT)
     MPiNets().plan(problem, 0.1, 1)  # compiles and loads
     result = MPiNets().plan(problem, 0.5, 1)

@@ -41,18 +41,21 @@ def test_failures_name_what_the_validator_refused_and_what_ended_the_search() ->
         if angle is not None:
             assert context.finish(np.stack([HOME, turned(angle)]), "test") is None
         ended = context.unsolved()
-        assert ended.refused == refused
-        assert ended.status is Status.NO_PATH and "the search ended" in ended.reason
+        assert ended.refused == refused and ended.status is Status.NO_PATH and "the search ended" in ended.reason
     late = context_for(BLOCKED, 1e-9).unsolved()
     assert late.status is Status.TIMEOUT and "longer time limit" in late.reason
 
 
-def test_a_result_notes_the_compile_time_once() -> None:
+def test_a_result_notes_the_compile_time_once_and_stops_that_nobody_asked_for() -> None:
     njit(lambda x: x + 1)(1)
     planner = load_planner("rrt_connect")
-    first, second = (planner.plan(context_for(BLOCKED).problem, time_limit=20.0) for _ in range(2))
-    assert sum("compiled for" in note and "not part of the planning" in note for note in first.notes) == 1
-    assert not any("compiled for" in note for note in second.notes)
+    both = [planner.plan(context_for(BLOCKED).problem, time_limit=20.0).notes for _ in range(2)]
+    assert [["compiled for" in note and "not part of the planning" in note for note in notes] for notes in both] == [[True], []]
+    stopping = {"stage": "", "deviations": np.zeros(3)}
+    planner.solve = lambda call, ends: call.finish(np.stack([ends.start, turned(-0.2), *ends.goals]), **stopping)  # type: ignore
+    for waypoints, noted in (((), True), ([turned(0.5)], False)):
+        result = planner.plan(Problem(load_robot("panda"), Scene([]), HOME, turned(1.2), waypoints=waypoints), time_limit=20.0)
+        assert any("stops on its way, at" in n for n in result.notes) == noted and result.stops == 1 + 2 * len(waypoints)
 
 
 def test_a_limit_that_runs_out_says_what_took_the_time(monkeypatch: pytest.MonkeyPatch) -> None:

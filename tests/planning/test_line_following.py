@@ -66,8 +66,7 @@ def test_motion_is_on_the_line_at_every_millisecond(name: str) -> None:
     # within limits, of which one is used, with few changes of the sign of an acceleration
     jerks = np.diff(t.accelerations, axis=0) / np.diff(t.times)[:, None]
     rates = (t.velocities, PANDA.velocity), (t.accelerations, PANDA.acceleration), (jerks, jerk_limits(PANDA))
-    shares = [(np.abs(rate) / limit).max() for rate, limit in rates]
-    assert 0.95 < max(shares) <= 1 + 1e-6
+    assert 0.95 < max((np.abs(rate) / limit).max() for rate, limit in rates) <= 1 + 1e-6
     strong = np.abs(t.accelerations) > 0.05 * np.abs(t.accelerations).max()
     for column, kept in zip(t.accelerations.T, strong.T, strict=True):
         assert (np.diff(np.sign(column[kept])) != 0).sum() <= 3
@@ -85,8 +84,7 @@ def test_ends_where_the_arm_gets_sooner(monkeypatch: pytest.MonkeyPatch) -> None
     """Of several configurations at the last pose, the line leads to one that may be further away than another."""
     found = {name: planned(T).duration for name, T in LINES.items()}
     monkeypatch.setattr(line_following, "faster_ends", lambda *_: [])
-    plain = {name: planned(T).duration for name, T in LINES.items()}
-    ratios = [found[name] / plain[name] for name in LINES]
+    ratios = [found[name] / planned(T).duration for name, T in LINES.items()]
     assert max(ratios) < 1.02 and min(ratios) < 0.97, ratios
 
 
@@ -106,5 +104,4 @@ def test_lines_out_of_reach_or_into_a_box_end_there() -> None:
     result = planned(moved([0, 0, -0.3]), rd.Scene([rd.Box([0.5, 0.05, 0.05], [0.3, 0.3, 0.1], name="table")]), time_limit=0.3)
     assert not result.solved and "table" in result.reason
     # fingertips are 0.112 m below the hand's origin; the table's top is at 0.1 m
-    gap = T_START[2, 3] - 0.112 - 0.1
-    assert result.fraction == pytest.approx(gap / 0.3, abs=0.05)
+    assert result.fraction == pytest.approx((T_START[2, 3] - 0.112 - 0.1) / 0.3, abs=0.05)

@@ -27,7 +27,7 @@ from robotdiffuse.planning import CLEARANCE, DEFAULT_PLANNER, PATH_CONSTRAINTS, 
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.search import rrt_kernel
-from robotdiffuse.problems.held_out import held_out_problem
+from robotdiffuse.problems.files import held_out_problem
 from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT
 from robotdiffuse.robots.parsing.urdf import with_limits
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
@@ -423,3 +423,8 @@ def test_limits_of_a_continuous_joint(tmp_path: FilePath) -> None:
     write_robot_folder(replace(ARM, joints=joints), tmp_path, {})
     robot = read_robot_folder(tmp_path)
     assert robot.planned_joints[0].kind == "continuous" and robot.upper[0] == CONTINUOUS_LIMIT
+
+
+def test_a_slow_start_velocity_near_a_joint_limit() -> None:
+    start = np.array([PANDA.upper[0] - 0.003, *HOME[1:]])
+    assert rd.plan(rd.Problem(PANDA, rd.Scene(), start, HOME, start_velocity=[0.001, 0, 0, 0, 0, 0, 0])).solved

@@ -120,8 +120,7 @@ def test_files_keep_them(tmp_path: Path) -> None:
         assert problem_record(problem_from_record(kept)) == kept
         each = problem.goal.goals[0] if isinstance(problem.goal, rd.AnyGoal) else problem.goal
         assert isinstance(each, rd.PosesGoal) and [one.frame for one in each.poses] == [*goal["poses"]]
-        T_world_frame = problem.T_world_base @ each.poses[0].T_base_frame
-        np.testing.assert_allclose(T_world_frame[:3, 3], pose["xyz"])
+        np.testing.assert_allclose((problem.T_world_base @ each.poses[0].T_base_frame)[:3, 3], pose["xyz"])
 
 
 def asked(*links: str) -> rd.Problem:

@@ -49,6 +49,8 @@ def test_poses_are_in_the_world() -> None:
     asked = (here, pose), (there, T_WORLD_BASE @ pose)
     one, other = (space.plan(goal, START, time_limit=10.0, planner="aorrtc", until="first") for space, goal in asked)
     assert np.allclose(one.path.positions[-1], other.path.positions[-1], atol=1e-4)
+    # Regression: the problem lacked its base, so files and pictures showed the obstacles elsewhere
+    assert np.allclose(other.problem.robot_and_scene_in_world()[1].shapes[0].bounds, ball.moved(T_WORLD_BASE).bounds)
     there.move("ball", T_WORLD_BASE @ rd.pose([0.5, 0.0, 0.6]))
     assert np.allclose(there.scene.shapes[0].bounds, ball.bounds)
 
@@ -90,8 +92,7 @@ def test_lines_through_waypoints_are_one_motion() -> None:
     result = space.plan_line(T, HOME, waypoints=corners, time_limit=20.0)
     assert result.solved and result.fraction == 1.0 and result.stops == 3, result.reason
     assert rd.verify(result.problem, result.trajectory).valid
-    inside = np.linalg.inv(T) @ np.array([space.pose(q) for q in result.trajectory.positions])
-    x, y, z = inside[:, :3, 3].T
+    x, y, z = (np.linalg.inv(T) @ np.array([space.pose(q) for q in result.trajectory.positions]))[:, :3, 3].T
     off = np.minimum(np.minimum(abs(x), abs(x - 0.05)), np.minimum(abs(y), abs(y - 0.05)))
     assert off.max() < 0.001 and np.abs(z).max() < 0.001
     far = space.plan_line(T @ rd.pose([0.0, 0.0, 2.0]), HOME, waypoints=corners[:1], time_limit=4.0)
@@ -287,3 +288,42 @@ def test_motions_with_other_payloads_or_moving_obstacles_or_from_a_velocity_are_
         refuses("another robot, scene or payload", rd.join, [there, other])
     refuses(r"results\[1\] has a start_velocity", rd.join, [there, planned(end, "ready", start_velocity=[0.1] * 7)])
     assert rd.join([loaded, back]).problem.payload is not None
+
+
+def test_a_base_that_is_moved_leaves_obstacles_in_the_world() -> None:
+    """Regressions: only `pose` knew the new base; contacts of a released object made every later plan an error."""
+    space, there = panda(), panda(T_world_base=T_WORLD_BASE)
+    for one in (space, there):
+        one.add(rd.Sphere([0.5, 0.0, 0.6], 0.2, name="ball"))
+    space.T_world_base = T_WORLD_BASE
+    assert np.allclose(space.scene.shapes[0].bounds, there.scene.shapes[0].bounds)
+    assert np.allclose(space.ik(space.pose(GOAL), near=GOAL)[0], GOAL, atol=1e-3)
+    space.add(rd.Sphere(space.pose(GOAL)[:3, 3], 0.01, name="pea"))
+    space.attach("pea", GOAL)
+    refuses("a shape is named pea, as an object that the robot holds", space.add, rd.Sphere([1, 1, 1], 0.1, "pea"))
+    space.allow("ball", ["pea", "panda_hand"])
+    space.detach("pea", GOAL)
+    assert space.scene.allowed_contacts == (("ball", ("panda_hand",)),) and space.is_free("ready")
+
+
+def test_steps_keep_what_they_were_given_and_may_be_a_thousand() -> None:
+    """Regressions: a changed array changed the steps made with it; many steps were a RecursionError; constraints were lost."""
+    xyz, T = np.array([0.0, 0.0, 0.1]), np.eye(4)
+    one, other = rd.MoveRelative(xyz), rd.MoveTo(T)
+    xyz[2] = T[2, 3] = 5.0
+    assert np.asarray(one.xyz)[2] == 0.1 and other.goal[2, 3] == 0.0
+    space = panda()
+    space.add(rd.Sphere(space.pose(GOAL)[:3, 3], 0.01, name="pea"))
+    result = space.plan_steps([rd.Attach("pea"), rd.Detach("pea")] * 600, GOAL)
+    assert result.solved and len(result.results) == 1200 and result.workspace.obstacles == ("pea",)
+    refuses("constraints are those of one step", space.plan_steps, [rd.MoveTo("ready")], HOME, constraints=[])
+
+
+def test_lists_of_blends_and_of_four_configurations_of_four_joints() -> None:
+    space = panda()
+    there = space.plan_line(space.pose(HOME) @ rd.pose([0.0, 0.0, 0.03]), HOME)
+    lines = [there, space.plan_line(space.pose(HOME), there.path.positions[-1])]
+    assert rd.join(lines, [0.0]).solved
+    refuses(r"blend is \[0.1\], but some motions have constraints", rd.join, lines, [0.1])
+    space = rd.Workspace(PANDA.with_locked({"panda_joint1": 0.0, "panda_joint3": 0.0, "panda_joint5": 0.0}))
+    assert space.plan([[0.1 * k, -1.8, 2.0, 0.8] for k in range(1, 5)], "ready", until="first").solved

@@ -13,7 +13,7 @@ from scipy.optimize import linprog
 
 import robotdiffuse as rd
 from helpers.refusals import refuses
-from robotdiffuse.planning.reactive.timed_path import TimedPath
+from robotdiffuse.planning.reactive.replanner import TimedPath
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.trajectories import speed_limits, timing_kernel
 from robotdiffuse.trajectories.speed_limits import MIN_JERK, TimingSettings, symmetric_bounds, timing_grid
@@ -118,14 +118,11 @@ def test_limits_rest_and_geometry(seed: int, count: int, scale: float, settings:
     check(q, timed(q, (lambda _: rng.random() < 0.5) if seed % 2 else always, settings=settings), settings)
 
 
-def test_one_joint_against_the_closed_form() -> None:
+def test_one_joint_against_the_closed_form_and_a_path_of_length_zero() -> None:
     """Bang-bang: 2 sqrt(d / a) below the velocity limit, d / v + v / a above it."""
     robot = arm((2.0,), (8.0,))
     for d, expected in ((0.125, 2 * np.sqrt(0.125 / 8)), (3.0, 3.0 / 2 + 2.0 / 8)):
         assert timed([[0.0], [d]], settings=NO_JERK_LIMIT, robot=robot).duration == pytest.approx(expected, rel=0.01)
-
-
-def test_path_of_length_zero_is_rows_at_rest() -> None:
     for rows in (1, 2, 5):
         t = timed(np.full((rows, 7), 0.3))
         assert t.times[0] == 0 and t.duration <= 4 * TimingSettings().sample_time

@@ -1,6 +1,7 @@
-"""Controls: candidate motions that come neither from a network nor from a search. Every learned result is
-compared with them."""
+"""Controls: candidate motions that come neither from a network nor from a search, such as the straight line
+in joint space. Every learned result is compared with them."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
@@ -11,18 +12,63 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.baselines.straight_line import shortest_accepted, straight_lines
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.settings import Count, Natural, OneOf, Settings
-from robotdiffuse.core.types import Configuration, Configurations, PlanResult
+from robotdiffuse.core.types import Configuration, Configurations, Path, PlanResult
 from robotdiffuse.datasets.shards import SPLITS, read_manifest, read_rows
 from robotdiffuse.learning.guidance import CollisionGuidance, Trajectories
+from robotdiffuse.learning.weight_files import stamp
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import nearest_goals
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.robots.robot import Robot
+
+NEAREST_GOAL = "nearest"
+ANY = "any"
+
+
+@dataclass(frozen=True)
+class StraightLineSettings(Settings, name="straight_line"):
+    goals: Annotated[str, OneOf((NEAREST_GOAL, ANY))] = ANY
+    """Goal configurations that are tried: only the nearest one, or all of them, the nearest first."""
+
+
+def shortest_accepted(
+    context: PlanningContext, start_goal: StartGoal, candidates: Iterable[Configurations], stage: str
+) -> PlanResult | None:
+    """The result of the shortest candidate that the validator accepts; None if it accepts none in time."""
+    names = context.problem.robot.joint_names
+    paths = [Path(names, start_goal.complete(q)) for q in candidates]
+    for path in sorted(paths, key=lambda path: path.length):
+        result = context.finish(path.positions, stage)
+        if result is not None or context.ended:
+            return result
+    return None
+
+
+def straight_lines(start_goal: StartGoal) -> ndarray:
+    """The straight lines from the start to the goals [goals, 2, dof]."""
+    start, goals = start_goal.leads()
+    return np.stack([np.broadcast_to(start, goals.shape), goals], axis=1)
+
+
+class StraightLine(Planner[StraightLineSettings]):
+    """Returns the shortest straight line from the start to a goal configuration that passes the validator."""
+
+    name = "straight_line"
+    settings_class = StraightLineSettings
+
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
+        """See `planning.planner.Planner`."""
+        lines = straight_lines(start_goal)
+        if self.settings.goals == NEAREST_GOAL:
+            lines = lines[[np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).argmin()]]
+        subject = "line is" if len(lines) == 1 else f"lines to {len(lines)} goal configurations are"
+        result = shortest_accepted(context, start_goal, lines, self.name)
+        return result or context.unsolved(f"the straight {subject} refused")
+
 
 # values of `ControlSettings.source`
 VIAS = "vias"
@@ -63,7 +109,10 @@ class ControlSettings(Settings, name="control"):
     def __post_init__(self) -> None:
         super().__post_init__()
         if (self.source == NEAREST) != (self.data is not None):
-            raise InputError(f"source is {self.source} and data is {self.data}; {NEAREST} alone needs data")
+            raise InputError(
+                f"source is {self.source} and data is {self.data}; {NEAREST} needs data, and other sources "
+                "take none"
+            )
         if self.data is not None:
             read_manifest(self.data)
 
@@ -104,13 +153,13 @@ class Control(Planner[ControlSettings]):
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
+        result = shortest_accepted(context, start_goal, straight_lines(start_goal), self.settings.source)
+        if result is not None:
+            return result
         candidates = self.candidates(*start_goal.leads(), start_goal.checker, context.rng)
-        for batch in (straight_lines(start_goal), candidates):
-            result = shortest_accepted(context, start_goal, batch, self.settings.source)
-            if result is not None:
-                return result
-        return context.unsolved(
-            f"the straight line and {counted(self.settings.samples, 'candidate')} are refused"
+        result = shortest_accepted(context, start_goal, candidates, self.settings.source)
+        return result or context.unsolved(
+            f"the straight line and {counted(len(candidates), 'candidate')} are refused"
         )
 
 
@@ -148,15 +197,22 @@ def smooth_noise(
 def fixed_vias(robot: Robot) -> Configurations:
     """The via configurations of the Panda [n, dof], the most useful first. Raises InputError for another
     robot."""
-    if robot.name != "panda":
-        raise InputError(f"source is {VIAS} and the robot {robot.name}; only the panda has fixed vias")
-    return np.loadtxt(FilePath(__file__).with_name("panda_vias.csv"), delimiter=",")
+    vias = np.loadtxt(FilePath(__file__).with_name("panda_vias.csv"), delimiter=",")
+    if robot.name != "panda" or robot.dof != vias.shape[1]:
+        about = f"source is {VIAS} and the robot {robot.name} with {counted(robot.dof, 'planned joint')}"
+        raise InputError(f"{about}; only the panda has fixed vias, for {vias.shape[1]} planned joints")
+    return vias
+
+
+def library(data: str, robot: Robot) -> Trajectories:
+    """Motions of the training split from the first shards of a data set. Trivial motions, whose straight line
+    from start to goal is free, are left out. They are read again if the data set was made anew."""
+    folder = FilePath(data).absolute()
+    return _library(folder, stamp(folder, "manifest"), robot)
 
 
 @lru_cache(maxsize=2)
-def library(data: str, robot: Robot) -> Trajectories:
-    """Motions of the training split from the first shards of a data set. Trivial motions, whose straight line
-    from start to goal is free, are left out."""
+def _library(data: FilePath, _stamp: object, robot: Robot) -> Trajectories:
     rows = islice(read_rows(data, robot, WAYPOINTS), LIBRARY_SHARDS)
     train = SPLITS.index("train")
     return np.concatenate([part.q[(part.split == train) & ~part.shard["line_free"]] for part in rows])
@@ -169,8 +225,7 @@ def bent(
     first. Each motion is bent to begin at the start and end at the goal: the offsets of its first row from
     the start and of its last row from the goal are interpolated linearly along the motion and subtracted."""
     both_directions = np.concatenate([motions, motions[:, ::-1]])
-    ends = np.stack([start, goal])
-    distance = np.square(both_directions[:, [0, -1]] - ends).sum(axis=(1, 2))
+    distance = np.square(both_directions[:, [0, -1]] - np.stack([start, goal])).sum(axis=(1, 2))
     nearest = both_directions[np.argsort(distance)[:count]]
     share = np.linspace(0.0, 1.0, nearest.shape[1])[:, None]
     return nearest + (1 - share) * (start - nearest[:, :1]) + share * (goal - nearest[:, -1:])

@@ -257,12 +257,12 @@ def collision_gradient(
     # all configurations are weighted means of waypoints: their weights [configurations, waypoints]
     numbers = np.arange((waypoints - 1) * (between + 1) + 1)
     offsets = numbers[:, None] / (between + 1) - np.arange(waypoints)
-    means = np.maximum(1 - np.abs(offsets), 0).astype(np.float32)
-    all_q = means @ q
+    weights = np.maximum(1 - np.abs(offsets), 0).astype(np.float32)
+    all_q = weights @ q
     squares, gradients = checker.cost_gradients(all_q.reshape(-1, q.shape[2]), margin, self_margin)
     gradients /= np.maximum(np.sqrt(2 * squares), np.float32(1e-6))[:, None]
-    means[numbers % (between + 1) > 0] /= max(between, 1)
-    return means.T @ gradients.reshape(all_q.shape)
+    weights[numbers % (between + 1) > 0] /= max(between, 1)  # each segment counts the mean of its costs
+    return weights.T @ gradients.reshape(all_q.shape)
 
 
 def limited(moves: Trajectories, most: float) -> Trajectories:
@@ -305,7 +305,7 @@ def exponential_levels(schedule: NoiseSchedule, steps: int) -> NoiseLevels:
     The betas of an exponential schedule grow by a constant factor. Levels that would coincide are moved
     apart. Raises InputError if the schedule has fewer levels than `steps`.
     """
-    schedule.sampling_levels(steps)
+    schedule.sampling_levels(steps)  # only for the check that there are enough levels
     betas = np.geomspace(*EXPONENTIAL_BETAS, steps)
     alpha_bar = np.cumprod(1 - betas)[:-1]
     target_log_snr = 0.5 * np.log(alpha_bar / (1 - alpha_bar))
@@ -432,7 +432,7 @@ def quadratic_levels(schedule: NoiseSchedule, steps: int) -> NoiseLevels:
     Evenly spaced levels would end at a high noise level, so that the network's error at that level would stay
     in the samples. Raises InputError if the schedule has fewer levels than `steps`.
     """
-    schedule.sampling_levels(steps)
+    schedule.sampling_levels(steps)  # only for the check that there are enough levels
     targets = schedule.steps * (np.arange(1, steps + 1) / steps) ** 2
     return falling(np.maximum(targets.round().astype(np.int64), 1), schedule.steps)
 

@@ -99,8 +99,8 @@ def _distance(s, u, v):
 @allocation_free()
 def _update_vertex(s, v):
     """UpdateVertex of D* Lite: sets the key of a node in the queue. The heuristic is the larger of two lower
-    bounds on the cost to the start: the Euclidean distance, and the cost of covering the summed joint
-    differences by moves of as many joints as possible."""
+    bounds on the cost to the start: the Euclidean distance, and the summed joint differences divided by
+    sqrt(k). Moves of the most joints, k, are the cheapest way to cover this sum: k for a cost of sqrt(k)."""
     node = s.nodes[v]
     queue = s.queue
     i = len(queue) // 2 + v
@@ -122,6 +122,7 @@ def _choose_parent(s, v):
     node.rhs = np.inf
     for m in range(len(s.moves)):
         s.offers[m] = s.nodes[find(s, node.at + s.moves[m], False)].g + s.costs[m]
+    # goals have their costs at the end of `offers`: goal 1 is the last
     for goal in range(1, s.goals + 1):
         distance, _, largest = _distance(s, v, goal)
         s.offers[-goal] = s.nodes[goal].g + distance if largest < 1 else np.inf
@@ -133,7 +134,7 @@ def _choose_parent(s, v):
         if motion_free(s.space, s.q[u], q, s.scratch):
             node.rhs = s.offers[m]
             node.parent = u
-        elif not motion_free(s.space, q, q, s.scratch):
+        elif not motion_free(s.space, q, q, s.scratch):  # v itself collides, so none of its edges is free
             return
         s.offers[m] = np.inf
 
@@ -196,12 +197,19 @@ def update(s, start):
     s.values[START] = find(s, start, True)
     for goal in range(1, s.goals + 1):
         s.nodes[goal].g = 0.0 if motion_free(s.space, s.q[goal], s.q[goal], s.scratch) else np.inf
-    for at in s.corners:
-        _choose_parent(s, find(s, at, True))
     for v in range(s.goals + 1, s.values[NODES]):
         if s.nodes[v].g < np.inf:
             _choose_parent(s, v)
             _offer(s, v)
+        _update_vertex(s, v)
+
+
+@kernel(nogil=True)
+def connect(s, corners):
+    """Connects nodes around goals with their best free neighbors or goals."""
+    for at in corners:
+        v = find(s, at, True)
+        _choose_parent(s, v)
         _update_vertex(s, v)
 
 
@@ -211,8 +219,8 @@ class DStarLiteSettings(CheckedSettings, name="d_star_lite"):
     """Step of the lattice [rad], or [m] for prismatic joints."""
     joints_per_move: Count = 1
     """Largest number of joints that an edge moves, each by one step. With 1, 2, 3 and 7 joints, paths are
-    2.1, 1.6, 1.35 and 1.2 times as long as the straight line on problems of the family rop; the more joints,
-    the slower the search."""
+    2.1, 1.6, 1.35 and 1.2 times as long as the straight line on problems of the family `rop`, the scenes of
+    the paper. The more joints, the slower the search."""
     max_nodes: Annotated[int, Bound(least=1.0, most=2e9)] = 2_000_000
     """Largest number of nodes in memory, besides those around the goals; a node takes about 100 bytes."""
 
@@ -285,20 +293,28 @@ class LatticeSearch:
         self.update(checker, start)
 
     def update(self, checker: CollisionChecker, start: Configuration) -> None:
-        """Take over a changed scene and a new start, which must be a node of the lattice. For D* Lite, `run`
-        then repairs the search."""
+        """Adopt a changed scene and a new start, which must be a node of the lattice, and compute all keys
+        again. For D* Lite, `run` then continues the search."""
         s = self._search
         at = np.round((start - s.origin) / s.spacing).astype(np.int64) @ s.strides
         space = padded_space(checker, np.vstack([start, self.goals]), *self._checks)
         self._search = s._replace(space=space, scratch=make_scratch(space, space.lower))
         update(self._search, at)
+        self._unconnected = s.corners
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:
         """Search until a path is found (FOUND), it is certain that there is none (EXHAUSTED), memory is full
         (FULL), or `stop` returns True (GOING)."""
         s = self._search
+        batch = max(CLOCK_INTERVAL // len(s.moves), 1)
+        while len(self._unconnected):
+            connect(s, self._unconnected[:batch])
+            self._unconnected = self._unconnected[batch:]
+            if len(self._unconnected) and stop():
+                self.cost = np.inf
+                return Outcome.GOING
         while True:
-            outcome = Outcome(search(s, max(CLOCK_INTERVAL // len(s.moves), 1)))
+            outcome = Outcome(search(s, batch))
             self.expansions = int(s.values[EXPANSIONS])
             if outcome is not Outcome.GOING or stop():
                 cost = s.nodes["g"][s.values[START]] if outcome is Outcome.FOUND else np.inf
@@ -338,7 +354,7 @@ class AStar(Planner[DStarLiteSettings]):
                     Outcome.EXHAUSTED: f"there is no path on the lattice; a finer {spacing} may have one",
                     Outcome.GOING: f"time ran out {after}; a coarser {spacing} searches faster",
                 }[outcome]
-                return context.fail(Status.NO_PATH if outcome > Outcome.FOUND else Status.TIMEOUT, reason)
+                return context.fail(Status.TIMEOUT if outcome == Outcome.GOING else Status.NO_PATH, reason)
             result = context.finish(start_goal.complete(path), self.name, f"solved by {self.name} {after}")
             if result is not None:
                 return result

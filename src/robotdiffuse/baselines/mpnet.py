@@ -61,8 +61,8 @@ class MPNetPlannerSettings(LearnedSettings, name="mpnet"):
     """Whether RRT-Connect replaces the parts that still collide after replanning."""
     resolution: Positive = 0.03
     """No point of the arm moves further than this between neighboring checked configurations [m]; the
-    validator certifies the motion in between. The resolution is halved after each path that the validator
-    refuses."""
+    validator certifies the motion in between. The resolution is halved, down to 2 mm, after each path that
+    the validator refuses."""
     clearance: NotNegative = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m]."""
 
@@ -96,9 +96,10 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
             elif best is None or candidate.broken < best.broken:
                 best = candidate
         result = None if best is None else context.finish(start_goal.complete(best.path), self.name)
+        remedy = "a longer time limit" if settings.hybrid else "a longer time limit or hybrid replanning"
         return result or context.unsolved(
-            f"no path of the network was valid in {context.elapsed:.2f} s, by round {rounds}; a "
-            "longer time limit or hybrid replanning may find one"
+            f"no path of the network was valid in {context.elapsed:.2f} s, by round {rounds}; {remedy} may "
+            "find one"
         )
 
 

@@ -311,6 +311,8 @@ class _Search:
         self._information.setMotionValidator(self._motions)
         self._information.setup()
         start, goals = start_goal.leads()
+        # loads the kernel, whose compilation does not count, before OMPL's own clock starts
+        motions_free(space, np.array([start, start], np.float32))
         self._backwards = planner.backwards
         first, last = (goals, start[None]) if self._backwards else (start[None], goals)
         self._goals = ob.GoalStates(self._information)

@@ -7,7 +7,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.input_files import file_name
+from robotdiffuse.core.files import file_name
 from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import CONVERGED, TIME
@@ -99,7 +99,7 @@ PLANNERS = Registry(
             "EDMP: the diffusion prior of MPD, guided by an ensemble of costs",
         ),
         "straight_line": _entry(
-            "baselines.straight_line:StraightLine",
+            "baselines.controls:StraightLine",
             "StraightLineSettings",
             SEARCH,
             "no planner: the straight line in joint space, as a baseline for all others",
@@ -148,8 +148,9 @@ def load_planner(name: str, settings: object | None = None, weights: str | None 
         The planner; its `plan` takes the arguments of `rd.plan`.
 
     Raises:
-        InputError: For an unknown name, settings of another planner, settings together with weights, weights
-            that cannot be read, and weights for a planner without a network.
+        InputError: For an unknown name, settings that are unknown, out of bounds or those of another planner,
+            settings together with weights, weights that cannot be read, and weights for a planner without a
+            network.
 
     Examples:
         >>> planner = rd.load_planner("rrt_connect", {"range": 0.5})
@@ -172,7 +173,8 @@ def load_planner(name: str, settings: object | None = None, weights: str | None 
 def planner_settings(name: str, assignments: Iterable[str]) -> Settings:
     """The default settings of a planner with some replaced: "range=0.5", "guidance.margin=0.02".
 
-    Raises InputError for an unknown planner, an unknown setting and a value out of bounds.
+    Raises InputError for an unknown planner or one without settings, for text that is not NAME=VALUE, for an
+    unknown setting, and for a value of the wrong type or out of bounds.
     """
     return _default_settings(name).changed(assignments)
 
@@ -215,8 +217,9 @@ def plan(
             does not count.
         seed: Seed of all random numbers, at least 0. The same seed gives the same path, unless time runs out.
         until: "first": return the first verified motion. "converged": improve the motion until more time
-            hardly improves it. "time_limit": improve it until time runs out. Planners that cannot improve a
-            path always return their first motion.
+            hardly improves it. "time_limit": improve it until time runs out. Planners other than aorrtc,
+            rrt_connect and robotdiffuse ignore it, except that with views and predicted obstacles in unknown
+            space, "first" makes them plan fewer motions.
         clearance: Distance to obstacles that aorrtc, rrt_connect and robotdiffuse keep wherever start, goal
             and passages allow it, at most 0.5 [m]. Elsewhere the distance is smaller, and a note says so.
             None: the problem's clearance, or 1 cm if it has none. Other planners refuse a clearance.

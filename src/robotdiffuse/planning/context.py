@@ -9,7 +9,6 @@ from numbers import Real
 from typing import Annotated, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.deadline import OutOfTimeError, check_cancelled, deadline
@@ -25,6 +24,7 @@ from robotdiffuse.core.types import (
     PlanResult,
     Status,
     Trajectory,
+    Values,
 )
 from robotdiffuse.problems.problem import MAX_CLEARANCE, Problem, check_problem
 from robotdiffuse.problems.units import unit_notes
@@ -47,8 +47,9 @@ CONSTRAINED_SAMPLE_TIME = 0.002
 """Time between the rows of motions under path constraints [s]. It is short, because the corners of such paths
 are close together."""
 EARLY_VALIDATION_FACTOR = 5.0
-"""A path is validated during the search if the time left for searching is more than this multiple of the time
-reserved for validating and timing a path."""
+"""Without path constraints, a path is validated during the search if the time left for searching is more than
+this multiple of the time reserved for validating and timing a path. Under path constraints, the multiple
+is 1."""
 TOLERANCE_FRACTION = 0.95
 """Fraction of each tolerance of path constraints that planners use; the remainder is a safety margin."""
 MAX_RESERVED_FRACTION = 0.5
@@ -58,6 +59,8 @@ RESERVED_FACTOR = 3.0
 has spent on one path."""
 EXPECTED_VALIDATION_TIME = 0.003
 """Time that is reserved for validating and timing the first path of a call [s]."""
+STOPS_NOTE = "the motion stops on its way, at "
+"""Beginning of the note on stops that nobody asked for; the times of the stops [s] follow."""
 MIN_TIME_LIMIT = 1e-3
 """Smallest time limit that `time_left` returns, even if the call's time has run out [s]."""
 
@@ -78,7 +81,7 @@ class PlanRequest(Settings):
 
 @runtime_checkable
 class Solver(Protocol):
-    """What `planning/pipeline` needs of a planner; `Planner` has it."""
+    """The part of a planner that `planning/pipeline` calls; every `Planner` is a Solver."""
 
     name: ClassVar[str]
 
@@ -105,8 +108,9 @@ def time_left(time_limit: float, began: float) -> float:
 
 def requested_clearance(problem: Problem, clearance: float | None) -> float:
     """The clearance of a call [m]: `clearance`, else the problem's, else DEFAULT_CLEARANCE."""
-    choices = (clearance, problem.clearance, DEFAULT_CLEARANCE)
-    return next(value for value in choices if value is not None)
+    if clearance is None:
+        clearance = problem.clearance
+    return DEFAULT_CLEARANCE if clearance is None else clearance
 
 
 @lru_cache
@@ -139,8 +143,8 @@ class PlanningContext:
             planner_name: Name of the planner, for the result.
             problem: The problem.
             request: The other arguments of the call.
-            segments: Number of planned paths that are joined into one motion. Timing uses so many
-                times the intervals of a single path.
+            segments: Number of planned paths that are joined into one motion. The timing's `line_intervals`
+                of a single path are multiplied by this number.
 
         Raises:
             InputError: If `problem` is not a Problem.
@@ -166,7 +170,8 @@ class PlanningContext:
         """The first violation of the last motion that was refused: where it is, as a fraction of the motion,
         and its message."""
         self._ended: tuple[Status, str] | None = None
-        """Status and reason of the result once no path can be finished any more; None before."""
+        """Status and reason of the result, after `finish` found that no motion can be finished any more; None
+        before."""
 
     @cached_property
     def rng(self) -> np.random.Generator:
@@ -206,9 +211,8 @@ class PlanningContext:
             Whether it deviates from the constraints by at most TOLERANCE_FRACTION of their tolerances.
         """
         constraints = self.validator.constraints
-        rows = q if len(q) > 1 else np.repeat(q, 2, axis=0)
         return constraints is None or not constraints.first_violation(
-            rows, tolerance_fraction=TOLERANCE_FRACTION
+            q if len(q) > 1 else np.repeat(q, 2, axis=0), tolerance_fraction=TOLERANCE_FRACTION
         )
 
     @property
@@ -277,8 +281,8 @@ class PlanningContext:
                 time ran out, or that the search ended.
 
         Returns:
-            A result with the status and reason that `finish` recorded, if it `ended` the call; else with
-            status TIMEOUT if time has run out, and NO_PATH if the search ended before.
+            A failed result. If `finish` has `ended` the call, the result has the status and reason that
+            `finish` recorded. Otherwise its status is TIMEOUT if time has run out, and NO_PATH if not.
         """
         if self._ended:
             return self.fail(*self._ended)
@@ -291,7 +295,7 @@ class PlanningContext:
         return self.fail(Status.NO_PATH, reason or ended)
 
     def deadline(self) -> AbstractContextManager[None]:
-        """Limit long steps to the time of the call.
+        """Limit the steps that call `check_time` or `check_timing` (see core/deadline.py) to the call's time.
 
         Returns:
             A context manager within which these steps raise OutOfTimeError when time runs out.
@@ -310,12 +314,14 @@ class PlanningContext:
         return self.fail(Status.TIMEOUT, self._too_short(error))
 
     def _too_short(self, error: OutOfTimeError) -> str:
-        limit = f"the time limit of {self.request.time_limit:g} s is too short {error.what}"
         before = (
-            f"the search began after {self._prepared:.2f} s" if self._prepared else "before the search began"
+            f"the search began after {self._prepared:.2f} s" if self._prepared else "the search had not begun"
         )
         first_path_note = f", its first path came after {self.first_path_at:.2f} s" if self._progress else ""
-        return f"{limit}: there was no time for {error} after {self.elapsed:.2f} s; {before}{first_path_note}"
+        return (
+            f"the time limit of {self.request.time_limit:g} s is too short {error.what}: there was no time "
+            f"for {error} after {self.elapsed:.2f} s; {before}{first_path_note}"
+        )
 
     @property
     def ended(self) -> bool:
@@ -329,7 +335,7 @@ class PlanningContext:
         reason: str = "",
         notes: tuple[str, ...] = (),
         keeps: Callable[[ndarray], bool] = lambda _: True,
-        deviations: Float[ndarray, "n"] | None = None,
+        deviations: Values | None = None,
         trajectory: Trajectory | None = None,
     ) -> PlanResult | None:
         """Validate the path through the waypoints, time it, and validate the motion.
@@ -359,7 +365,8 @@ class PlanningContext:
             waypoints = np.insert(waypoints, turns + 1, middles, axis=0)
             deviations = np.insert(deviations, turns + 1, self.timing.corner_deviation)
         path = Path(problem.robot.joint_names, waypoints)
-        # timing usually has just validated the trajectory that it returns
+        # Timing usually returns the last motion that it validated; thanks to the cache, this motion is not
+        # validated again.
         report_of = lru_cache(maxsize=1)(self.validator.trajectory)
         try:
             with self.deadline():
@@ -367,22 +374,19 @@ class PlanningContext:
                 if report.violation is not None:
                     return self._refuse(report.violation, float(len(waypoints) - 1))
                 planning_time = self.elapsed
-                trajectory = (
-                    trajectory
-                    or time_parameterize(
+                if trajectory is None:
+                    velocity = problem.start_velocity
+                    trajectory = time_parameterize(
                         problem.robot,
                         path,
                         lambda motion: report_of(motion).valid,
                         self.validator.collision_free,
                         self.timing,
                         keeps,
-                        0.0
-                        if problem.start_velocity is None
-                        else float(np.linalg.norm(problem.start_velocity)),
-                        self.beside,
+                        0.0 if velocity is None else float(np.linalg.norm(velocity)),
+                        self.extra_limits,
                         deviations,
                     ).trajectory
-                )
                 timed = report_of(trajectory)
         except OutOfTimeError as error:
             self._ended = Status.TIMEOUT, self._too_short(error)
@@ -393,9 +397,6 @@ class PlanningContext:
             if timed.violation.kind == "time":  # every motion of this problem would take too long to validate
                 self._ended = Status.NO_PATH, timed.violation.message
             return self._refuse(timed.violation, trajectory.duration)
-        stops = ", ".join(f"{at:.3g} s" for at in trajectory.stops)
-        if stops:
-            notes = (*notes, f"the motion stops on its way, at {stops}: corners there could not be rounded")
         # Progress ends with the returned path, at the time when the search recorded its length. Shorter
         # recorded paths are left out, since they were refused.
         tolerance = path.length * 1e-3
@@ -419,7 +420,7 @@ class PlanningContext:
         )
 
     @property
-    def beside(self) -> ExtraLimits:
+    def extra_limits(self) -> ExtraLimits:
         """Limits on timing in addition to the joint limits: speed limits of constraints, and torque limits
         with a payload."""
         constraints = self.validator.constraints

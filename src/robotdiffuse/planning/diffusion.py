@@ -6,7 +6,8 @@ If no sample is valid, the next batch is drawn from new noise, until time runs o
 and the straight line is not tried, so every solution comes from the network and its guidance.
 
 The paper's method is samples=1, repeat=false and weights of config `paper`, which do not take clearances as
-inputs. With guidance_steps=0 in addition, it is the method JPC of the paper's Table 2, without guidance.
+inputs. With guidance_steps=0 too, it is row JPC of the paper's Table 2: trained with losses on joints,
+points and collision, and sampled without guidance.
 
 Path constraints add a cost to guidance. Before validation, the inner waypoints of each sample are projected
 onto the constraints; the validator proves that the constraints hold between waypoints as well. The network
@@ -16,7 +17,6 @@ The sampler and the number of its steps are stored with the weights; settings ma
 """
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -26,7 +26,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.settings import Count, Natural, NotNegative
 from robotdiffuse.core.types import Configuration, Configurations, Path, PlanResult
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings, Trajectories
-from robotdiffuse.learning.motion_model import SamplingSettings
+from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel, SamplingSettings, link_clearances
 from robotdiffuse.planning import PATH_CONSTRAINTS
 from robotdiffuse.planning.context import TOLERANCE_FRACTION, PlanningContext
 from robotdiffuse.planning.learned import ExportedPlanner, LearnedSettings, nearest_goals
@@ -34,14 +34,11 @@ from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.scenes.surface_points import sample_surface
 
-if TYPE_CHECKING:
-    from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel
-
 
 @dataclass(frozen=True)
 class DiffusionSettings(SamplingSettings, LearnedSettings, name="diffusion"):
     guidance_steps: Natural = 8
-    """Number of gradient steps at each guided denoising step; 0: no guidance."""
+    """Number of guidance steps at each guided denoising step; 0: no guidance."""
     points: Count = 320
     """Number of points in the encoder's input cloud (paper: 1,400); ignored by encoders for clouds of a fixed
     size."""
@@ -55,7 +52,7 @@ class DiffusionSettings(SamplingSettings, LearnedSettings, name="diffusion"):
 
 
 def encode(
-    model: "MotionModel", checker: CollisionChecker, points: int, rng: np.random.Generator
+    model: MotionModel, checker: CollisionChecker, points: int, rng: np.random.Generator
 ) -> Float[ndarray, "embedding"]:
     """The embedding z of a scene: the output of the frozen encoder for `points` random points on the scene's
     surfaces. An encoder for clouds of a fixed size gets that number of points."""
@@ -82,13 +79,13 @@ class Diffusion(ExportedPlanner[DiffusionSettings]):
 
     def draw(
         self,
-        model: "MotionModel",
+        model: MotionModel,
         checker: CollisionChecker,
         embedding: Float[ndarray, "embedding"],
         start: Configuration,
         goals: Configurations,
         rng: np.random.Generator,
-        clearances: "ClearanceFn | None" = None,
+        clearances: ClearanceFn | None = None,
         constraints: PathConstraints | None = None,
     ) -> Trajectories:
         """A batch of samples under guidance, divided among the nearest goals.
@@ -97,8 +94,6 @@ class Diffusion(ExportedPlanner[DiffusionSettings]):
         clearances: the function that computes the model's clearance inputs; None: from the checker's scene.
         constraints: path constraints, which add a cost to guidance.
         """
-        from robotdiffuse.learning.motion_model import link_clearances
-
         settings = self.settings
         guidance = CollisionGuidance(checker, settings.guidance, constraints, TOLERANCE_FRACTION)
         goals = nearest_goals(start, goals, settings.samples)
@@ -126,7 +121,7 @@ class Diffusion(ExportedPlanner[DiffusionSettings]):
         """See `planning.planner.Planner`."""
         model = self.network(context.problem.robot)
         rng = context.rng
-        start, goals = start_goal.leads()
+        start, goals = start_goal.leads()  # free configurations; `complete` adds the ends
         embedding = encode(model, start_goal.checker, self.settings.points, rng)
         names = context.problem.robot.joint_names
         constraints = context.validator.constraints

@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import path_length
 from robotdiffuse.core.transforms import rotation_about
-from robotdiffuse.core.types import PlanResult, Status
+from robotdiffuse.core.types import Configuration, Configurations, PlanResult, Pose, Poses, Status
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.problems.compiled_constraints import line_end, rotation_vector
 from robotdiffuse.problems.constraints import CartesianLine
@@ -65,6 +66,8 @@ SAME = 1e-5
 TOLERANCES = 1e-9, 1e-9
 """Tolerances of inverse kinematics at the poses [m], [rad]. They are small, because the second derivative of
 the curve divides errors by the square of the step."""
+CLEARANCE_SHARE = 0.5
+"""A note names the clearance of a motion that keeps less than this fraction of the clearance of the call."""
 ROUND = InverseKinematicsSettings(max_rounds=1)
 """For the search for other configurations of the end pose, see OTHER_ENDS."""
 
@@ -84,8 +87,7 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
     line = next(entry for entry in problem.constraints if isinstance(entry, CartesianLine))
     T_end = line_end(problem, line)
     T_start = robot.fk(problem.start, line.frame)
-    off = np.abs(T_end - T_start)[:, 3 if line.angle is None else slice(None)]
-    if off.max() < HERE:
+    if np.abs(T_end - T_start)[:, 3 if line.angle is None else slice(None)].max() < HERE:
         rest = np.stack([problem.start, problem.start])
         return context.finish(rest, STAGE, "the start is the end of the line")
     targets = _poses(T_start, T_end)
@@ -95,7 +97,7 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
     chain = ik_chain(robot, line.frame, LIMIT_MARGIN)
     limits = scaled_limits(robot, context.timing)
 
-    def cost(rows: Float[ndarray, "n dof"]) -> float:
+    def cost(rows: Configurations) -> float:
         """Approximate minimum duration [s] of a motion through configurations within the limits of velocity
         and acceleration."""
         first = np.gradient(rows, axis=0)
@@ -105,7 +107,7 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
         grid = np.arange(float(len(rows)))
         return duration_of(grid, fastest_speeds(first, second, grid, limits[0], *bounds))
 
-    def tried(end: Float[ndarray, "dof"] | None) -> bool:
+    def tried(end: Configuration | None) -> bool:
         """Whether the line can be followed to its last pose, while joints are steered to the configuration
         `end` if it is given. The motion becomes a candidate if it ends in this configuration."""
         nonlocal fraction, why
@@ -126,27 +128,27 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
         for end in robot.nearest_turns(problem.goal.positions, problem.start):
             tried(end)
     elif not tried(None):
-        round_settings = replace(ROUND, position_only=line.angle is None)
         ends = inverse_kinematics(
             robot,
             line.frame,
             T_end,
             OTHER_ENDS,
             rng=context.rng,
-            settings=round_settings,
+            settings=replace(ROUND, position_only=line.angle is None),
             near=problem.start,
             rest=problem.start,
         )
         for end in ends:
             tried(end)
-    elif line.speed is None:
-        candidates += faster_ends(problem, line, targets, *chain, *candidates[0], cost)
+    elif line.speed is None:  # `tried(None)` has followed the line to its end, and added a candidate
+        best_cost, followed = candidates[0]
+        candidates += faster_ends(problem, line, targets, *chain, best_cost, followed, cost)
     for _, rows in sorted(candidates, key=lambda entry: entry[0]):
-        trajectory = time_curve(robot, rows, context.timing, context.beside)
+        trajectory = time_curve(robot, rows, context.timing, context.extra_limits)
         context.improved(float(path_length(rows)))
         result = context.finish(rows, STAGE, "solved along the straight line", trajectory=trajectory)
         if result is not None:
-            return result
+            return _with_clearance_note(context, result)
         if context.ended:
             break
         fraction_followed, message = context.refused_at
@@ -157,7 +159,23 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
     return replace(context.fail(Status.NO_PATH, why), fraction=fraction)
 
 
-def _poses(T_start: Float[ndarray, "4 4"], T_end: Float[ndarray, "4 4"]) -> Float[ndarray, "n 4 4"]:
+def _with_clearance_note(context: PlanningContext, result: PlanResult) -> PlanResult:
+    """The result, with a note if the motion keeps much less than the clearance of the call, although start
+    and end keep more."""
+    ends = result.path.positions[[0, -1]]
+    checker = CollisionChecker(context.problem.robot, context.problem.scene)
+    at_ends = float(checker.link_clearances(ends).min(initial=np.inf))
+    clearance = result.scene_clearance
+    if clearance >= CLEARANCE_SHARE * min(context.clearance, at_ends):
+        return result
+    note = (
+        f"the motion along the line does not keep a clearance of {100 * context.clearance:.2g} cm; "
+        f"it keeps {100 * clearance:.2g} cm"
+    )
+    return replace(result, notes=(*result.notes, note))
+
+
+def _poses(T_start: Pose, T_end: Pose) -> Poses:
     """Poses T_base_link along the line, evenly spaced, without the start and with the end."""
     displacement = T_end[:3, 3] - T_start[:3, 3]
     turn = rotation_vector(T_end[:3, :3] @ T_start[:3, :3].T)
@@ -174,7 +192,7 @@ def _poses(T_start: Float[ndarray, "4 4"], T_end: Float[ndarray, "4 4"]) -> Floa
 def faster_ends(
     problem: Problem,
     line: CartesianLine,
-    targets: Float[ndarray, "n 4 4"],
+    targets: Poses,
     arm: Int[ndarray, "j"],
     joints: IKChain,
     best_cost: float,
@@ -218,11 +236,11 @@ def faster_ends(
 def _followed(
     problem: Problem,
     line: CartesianLine,
-    targets: Float[ndarray, "n 4 4"],
+    targets: Poses,
     arm: Int[ndarray, "j"],
     joints: IKChain,
-    end: Float[ndarray, "dof"] | None,
-) -> Float[ndarray, "k dof"]:
+    end: Configuration | None,
+) -> Configurations:
     """Configurations at the start and at the poses in `targets`, up to the last pose that joints can follow.
 
     end: the goal configuration to which the joints `arm` are steered; None: no steering. Joints that do not
@@ -242,7 +260,7 @@ def _followed(
     return q
 
 
-def _obstruction(robot: Robot, q: Float[ndarray, "dof"]) -> str:
+def _obstruction(robot: Robot, q: Configuration) -> str:
     """Why a line cannot be followed beyond this configuration."""
     limit_distance = np.where(robot.continuous, np.inf, np.minimum(q - robot.lower, robot.upper - q))
     j = int(limit_distance.argmin())

@@ -9,14 +9,16 @@ from inspect import signature
 from numbers import Integral
 from typing import Any
 
+import numpy as np
+
 from robotdiffuse.core.errors import InputError, check_name, shown
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import PlanResult, Status
 from robotdiffuse.planning import DEFAULT_PLANNER, load_planner
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.problems.problem import Problem, check_problem
-from robotdiffuse.processes.ray_cluster import CLUSTERS
 from robotdiffuse.processes.workers import (
+    CLUSTERS,
     EndedError,
     NotStartedError,
     Results,
@@ -80,7 +82,7 @@ def plan_many(
         [True, True]
     """
     check_not_importing()
-    if isinstance(problems, str) or not isinstance(problems, Iterable):
+    if isinstance(problems, str) or not np.iterable(problems):
         raise InputError(f"problems is {shown(problems)}; it must be a list of Problems")
     problems = list(problems)
     for i, problem in enumerate(problems):

@@ -12,7 +12,7 @@ from robotdiffuse.core.loading import compile_note, loading
 from robotdiffuse.core.settings import NotNegative, Positive, Settings
 from robotdiffuse.core.types import CONVERGED, PlanResult
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS, planners_that_support
-from robotdiffuse.planning.context import PlanningContext, PlanRequest
+from robotdiffuse.planning.context import STOPS_NOTE, PlanningContext, PlanRequest
 from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
 from robotdiffuse.problems.constraints import CartesianLine
 from robotdiffuse.problems.problem import Problem, check_problem
@@ -84,11 +84,17 @@ class Planner(ABC, Generic[PlannerSettings]):
         """
         check_problem(problem)
         result = self._plan(problem, PlanRequest(*values, **request))
-        note = compile_note()
+        notes = result.notes
         if result.path is not None:
             reached = goal_index(problem.robot, problem.goal, result.path.positions[-1])
             result = replace(result, goal_index=reached)
-        return replace(result, problem=problem, notes=(*result.notes, note) if note else result.notes)
+            # with waypoints or moving obstacles, stops and waits are wanted
+            if result.trajectory is not None and not (problem.waypoints or problem.moving):
+                stops = ", ".join(f"{at:.3g} s" for at in result.trajectory.stops)
+                if stops:
+                    notes += (f"{STOPS_NOTE}{stops}: corners there could not be rounded",)
+        note = compile_note()
+        return replace(result, problem=problem, notes=(*notes, note) if note else notes)
 
     def _plan(self, problem: Problem, request: PlanRequest) -> PlanResult:
         clearance = problem.clearance if request.clearance is None else request.clearance
@@ -126,8 +132,7 @@ class Planner(ABC, Generic[PlannerSettings]):
         results = [call(Problem(robot, Scene(), start, goal), EASY_TIME_LIMIT)]
         # a ball on the straight line forces a path with corners, which needs more compiled code
         ends = [] if results[0].path is None else [results[0].path.positions[-1]]
-        on_line = [start + share * (end - start) for end in ends for share in (0.5, 0.35)]
-        for q in on_line:
+        for q in [start + share * (end - start) for end in ends for share in (0.5, 0.35)]:
             ball = Sphere(robot.fk(q)[:3, 3], WARM_UP_RADIUS)
             results.append(call(Problem(robot, Scene([ball]), start, goal), EASY_TIME_LIMIT))
         last = replace(problem, waypoints=(), blend=(), moving=(), start_velocity=None)
@@ -139,8 +144,8 @@ class Planner(ABC, Generic[PlannerSettings]):
         """Plan from the problem's start to its goal by one call of `solve`.
 
         Args:
-            problem: The problem. Its waypoints, moving obstacles, start velocity and unknown space are
-                ignored, since `planning/pipeline` handles them.
+            problem: The problem, without waypoints, moving obstacles, start velocity and views, which
+                `planning/pipeline` handles.
             request: The arguments of the call.
 
         Returns:

@@ -7,17 +7,26 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.collision.motions import search_space
+from robotdiffuse.core.errors import counted
 from robotdiffuse.core.loading import loading
-from robotdiffuse.core.types import Configuration, Configurations, PlanResult, Status
+from robotdiffuse.core.types import Configuration, Configurations, Mask, PlanResult, Status, Values
 from robotdiffuse.perception.depth_view import SeenPoints
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.problems.problem import AnyGoal, Goal, JointGoal, OneGoal, PoseGoal, PosesGoal, poses_of
+from robotdiffuse.problems.problem import (
+    AnyGoal,
+    Goal,
+    JointGoal,
+    OneGoal,
+    PoseGoal,
+    PosesGoal,
+    goals_of,
+    poses_of,
+)
 from robotdiffuse.problems.units import arm_in_cloud_note
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -27,8 +36,8 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.compiled_constraints import PathConstraints
 
 GOAL_TIME_FRACTION = 0.5
-"""Of several goals, no more are tried after this fraction of the time limit. But the first pass over the
-goals goes on until one is free, and the second tries at least one."""
+"""After this fraction of the time limit, no further goals of a list are tried. But the first pass over the
+goals goes on until one is free, and the second pass tries at least one."""
 NEAR_POSE_FRACTIONS = (0.1, 0.3, 0.9)
 """If no configuration reaches a pose exactly, some within these fractions of the validator's goal tolerances
 are sought, in this order."""
@@ -57,9 +66,9 @@ MAX_OVERTURN = np.pi / 2
 
 
 class StartGoal:
-    """The start and the goals of a search, each with a lead: a nearby configuration whose covering spheres
-    are free, from which or to which the search plans. The lead of a free configuration is the configuration
-    itself.
+    """The start and the goals of a search, each with a lead. A search plans from and to leads: a lead is a
+    nearby configuration whose covering spheres are free. The lead of a free configuration is the
+    configuration itself.
 
     Whole turns are removed from continuous joints of the start; `complete` adds them to the path. A search
     does not wrap angles, so each goal is replaced by copies with whole turns of its continuous joints
@@ -145,8 +154,7 @@ class StartGoal:
         """
         assert self.start_lead is not None
         path = path.astype(np.float64)
-        errors = [np.abs(path[-1] - lead).max() for lead in self.goal_leads]
-        i = int(np.argmin(errors))
+        i = int(np.argmin([np.abs(path[-1] - lead).max() for lead in self.goal_leads]))
         rows = [self.start[None], path[1:-1], self.goals[i][None]]
         if not direct and not np.array_equal(self.goal_leads[i], self.goals[i]):
             rows.insert(2, self.goal_leads[i][None])
@@ -184,9 +192,10 @@ def falling_clearances(most: float, checker: CollisionChecker, states: Configura
 def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
     """The start and the goals for the search of a call; a failed result if there are none.
 
-    A pose gives at most `pose_goals.GOAL_COUNT` configurations whose covering spheres are free, at most
-    MAX_GRAZING_GOALS nearer to the start with only the exact meshes free, and copies of all with whole turns.
-    Joint goals with only the meshes free are used if no joint goal has free spheres.
+    A pose gives at most `pose_goals.GOAL_COUNT` configurations whose covering spheres are free. At most
+    MAX_GRAZING_GOALS configurations are added whose covering spheres collide but whose exact meshes are free,
+    if they are nearer to the start; then copies of all with whole turns. Of a JointGoal, configurations with
+    only the meshes free are used if none has free spheres.
     Several goals are tried with little work each; only if none is free, they are tried again with more.
     """
     checker = CollisionChecker(context.problem.robot, context.problem.scene)
@@ -263,11 +272,16 @@ def _usable_goals(context: PlanningContext, checker: CollisionChecker) -> Config
     goals = _goals(context, context.problem.goal, checker)
     if isinstance(goals, PlanResult):
         return goals
-    holdable = [q for q in goals if _too_heavy(context, q) is None]
-    if not holdable:
+    holdable = _holdable(context, goals)
+    if not len(holdable):
         reason = f"the payload cannot be held at the goal: {_too_heavy(context, goals[0])}"
         return context.fail(Status.INVALID_GOAL, reason)
-    return goals if len(holdable) == len(goals) else np.stack(holdable)
+    return holdable
+
+
+def _holdable(context: PlanningContext, goals: Configurations) -> Configurations:
+    """The configurations at which the arm can hold the problem's payload; all if it has none."""
+    return goals[[_too_heavy(context, q) is None for q in goals]]
 
 
 def _too_heavy(context: PlanningContext, q: Configuration) -> str | None:
@@ -289,7 +303,7 @@ def _any_goals(
     context: PlanningContext, goals: Sequence[OneGoal], checker: CollisionChecker
 ) -> Configurations | PlanResult:
     """The free configurations of several goals. The first pass does little work for each goal; if no goal is
-    free, the second pass does more."""
+    free, or the payload cannot be held at any that is, the second pass does more."""
     until = GOAL_TIME_FRACTION * context.request.time_limit
     free = list[ndarray]()
     exact = [goal for goal in goals if isinstance(goal, PoseGoal) and not goal.tolerant]
@@ -312,7 +326,10 @@ def _any_goals(
             result = _first_try(context, goal, checker)
             free += [result] if len(result) else []
     if free:
-        return np.concatenate(free)
+        holdable = _holdable(context, np.concatenate(free))
+        if len(holdable):
+            return holdable
+        free = []
     failures = list[PlanResult]()
     for goal in goals:
         if (free or failures) and context.elapsed > until:
@@ -362,6 +379,9 @@ def _free_goals(
     if usable:
         return np.stack(usable)
     reason = f"{_all_goals(positions, 'is', 'are')} in collision: {collisions[0]}"
+    excluded = len(goal.positions) - len(positions)
+    if excluded:
+        reason += f"; the constraints exclude {counted(excluded, 'other goal configuration')}"
     return context.fail(Status.INVALID_GOAL, reason)
 
 
@@ -381,13 +401,13 @@ def _pose_goals(
     start = problem.start
     rejected = np.zeros((0, robot.dof))
 
-    def free(q: Configurations) -> Bool[ndarray, "n"]:
+    def free(q: Configurations) -> Mask:
         nonlocal rejected
-        free = checker.free(q)
-        rejected = np.concatenate([rejected, q[~free]])
-        return free
+        is_free = checker.free(q)
+        rejected = np.concatenate([rejected, q[~is_free]])
+        return is_free
 
-    def distances(q: Configurations) -> Float[ndarray, "n"]:
+    def distances(q: Configurations) -> Values:
         return np.linalg.norm(q - start, axis=1)
 
     configurations = pose_configurations(problem, goal, rng, free)
@@ -399,8 +419,12 @@ def _pose_goals(
                 problem, goal, rng, free, rounds=NEAR_POSE_ROUNDS, exact=near
             )
             if len(configurations) or len(rejected):
+                several = isinstance(problem.goal, AnyGoal)
+                index = next((i for i, each in enumerate(goals_of(problem.goal)) if each is goal), 0)
+                prefix = f"goal {index}: " if several else ""
+                motion = "a motion to it" if several else "the motion"
                 note = (
-                    f"no configuration reaches the goal pose exactly; the motion ends within "
+                    f"{prefix}no configuration reaches the goal pose exactly; {motion} ends within "
                     f"{1e3 * near[0]:g} mm and {np.degrees(near[1]):.2g} degrees of it"
                 )
                 break

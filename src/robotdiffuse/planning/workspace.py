@@ -13,15 +13,15 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.core.errors import (
     InputError,
+    check_name,
     check_type,
     counted,
     located,
     numbers,
     rigid_transform,
     shown,
-    unknown_name,
 )
-from robotdiffuse.core.transforms import inverse, pose, rpy_from_rotation
+from robotdiffuse.core.transforms import inverse, rpy_from_rotation
 from robotdiffuse.core.transforms import pose as pose_matrix
 from robotdiffuse.core.types import AnyConfiguration, Configuration, PlanResult, Trajectory
 from robotdiffuse.planning import plan
@@ -30,6 +30,7 @@ from robotdiffuse.planning.pipeline.waypoints import join, one_after_another
 from robotdiffuse.problems.constraints import CartesianLine, Constraint
 from robotdiffuse.problems.problem import (
     AnyGoal,
+    Goal,
     JointGoal,
     PoseGoal,
     Problem,
@@ -49,7 +50,18 @@ LINE_TIME_LIMIT = 0.3
 """Time limit for planning a straight line after a `MoveTo` step [s]. It is short, because if the line fails,
 the `MoveTo` step is planned again to another end."""
 SAME_END = 0.1
-"""Two end configurations of a step are different if a joint differs by more than this [rad] or [m]."""
+"""Two end configurations of a step are different if a joint differs by more than this [rad] or [m], apart
+from whole turns of continuous joints."""
+
+
+def _kept(value: Any) -> Any:
+    """The value with copies of its arrays, lists and tables, which do not change with what was given."""
+    if isinstance(value, list):
+        return [_kept(entry) for entry in value]
+    if isinstance(value, dict):
+        return {name: _kept(entry) for name, entry in value.items()}
+    array = numbers(value) if isinstance(value, ndarray) or hasattr(value, "detach") else None
+    return value if array is None else array
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +81,10 @@ class MoveTo:
     name: str = "move to"
     """Name of the step, for messages."""
 
+    def __post_init__(self) -> None:
+        for name in ("goal", "constraints", "contacts"):
+            object.__setattr__(self, name, _kept(getattr(self, name)))
+
 
 @dataclass(frozen=True, eq=False)
 class MoveRelative:
@@ -81,7 +97,7 @@ class MoveRelative:
     tolerance: float = 0.001
     """Largest distance of the tip from the line [m]."""
     contacts: Contacts = field(default_factory=dict)
-    """As for `MoveTo`."""
+    """Permitted contacts, as in `MoveTo`."""
     name: str = "move relative"
     """Name of the step, for messages."""
 
@@ -91,6 +107,8 @@ class MoveRelative:
             raise InputError(f"{self.name}: xyz is {shown(self.xyz)}; it must be 3 finite numbers [m]")
         if not isinstance(self.frame, str) or self.frame not in (TIP, WORLD):
             raise InputError(f"{self.name}: frame is {shown(self.frame)}; it must be {TIP!r} or {WORLD!r}")
+        object.__setattr__(self, "xyz", xyz)  # a copy, which does not change with the array that was given
+        object.__setattr__(self, "contacts", _kept(self.contacts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +123,9 @@ class Attach:
     """Further links that it may touch while it is held."""
     name: str = "attach"
     """Name of the step, for messages."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "touch_links", _kept(self.touch_links))
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +204,8 @@ class StepsResult:
         for step, result in zip(self.steps, self.results, strict=False):
             if step.name == name and result is not None and result.goal_index is not None:
                 return result.goal_index
-        raise InputError(f"no motion was planned for a step {shown(name)}")
+        names = ", ".join(step.name for step in self.steps if isinstance(step, MoveTo))
+        raise InputError(f"no motion was planned for a step {shown(name)}; MoveTo steps: {names or 'none'}")
 
 
 def plan_steps(
@@ -197,12 +219,15 @@ def plan_steps(
         check_type(f"steps[{i}]", step, Step.__args__, "rd.MoveTo, MoveRelative, Attach or Detach")
         if isinstance(step, MoveTo | MoveRelative):
             check_type(f"steps[{i}].contacts", step.contacts, Mapping, "a mapping of obstacles to links")
+    if "constraints" in request:
+        raise InputError("constraints are those of one step; give them to rd.MoveTo")
     PlanRequest(time_limit)  # raises InputError for a wrong limit, before the limit is divided
     furthest = StepsResult((), (), space, "", 0.0)
     tried_ends = 0
 
     def motions(k: int, space: Any, q: Configuration) -> Iterator[PlanResult]:
-        """Motions of step k from q, each to another goal or goal configuration; the last may be a failure."""
+        """Motions of step k from q, each to another goal or goal configuration. If the first one fails, the
+        failed result is the only one; if a later one fails, there are no more."""
         step = steps[k]
         assert isinstance(step, MoveTo | MoveRelative)
         space = copy(space)
@@ -211,7 +236,7 @@ def plan_steps(
         seconds_left /= sum(isinstance(later, MoveTo | MoveRelative) for later in steps[k:])
         if isinstance(step, MoveRelative):
             T = space.pose(q)
-            end = pose(step.xyz) @ T if step.frame == WORLD else T @ pose(step.xyz)
+            end = pose_matrix(step.xyz) @ T if step.frame == WORLD else T @ pose_matrix(step.xyz)
             if any(isinstance(earlier, MoveTo) for earlier in steps[:k]):
                 seconds_left = min(seconds_left, LINE_TIME_LIMIT)
             yield space.plan_line(end, q, step.tolerance, time_limit=seconds_left, **request)
@@ -225,7 +250,9 @@ def plan_steps(
             ends = _goal_ends(result.problem)
             indices = [result.goal_index]
         while result.solved:
-            ends = [(i, end) for i, end in ends if np.abs(end - result.path.positions[-1]).max() > SAME_END]
+            gaps = np.array([end for _, end in ends]).reshape(-1, space.robot.dof) - result.path.positions[-1]
+            gaps -= space.robot.whole_turns(gaps)
+            ends = [end for end, gap in zip(ends, gaps, strict=True) if np.abs(gap).max() > SAME_END]
             # ends at goals that no earlier motion reached come first
             untried = [(i, end) for i, end in ends if i not in indices] or ends
             if not untried:
@@ -236,49 +263,49 @@ def plan_steps(
                 indices.append(index)
                 yield replace(result, goal_index=index)
 
-    def planned(
-        k: int, space: Any, q: Configuration, results: tuple[PlanResult | None, ...]
-    ) -> StepsResult | None:
-        """A result for all steps. The first k steps are planned already, with these `results`, and end at q.
-        None if a later step fails; `furthest` then holds the failure that came after the most steps."""
-        nonlocal furthest, tried_ends
-        if k == len(steps):
-            return StepsResult(
-                tuple(steps), results, space, f"solved in {counted(k, 'step')}", clock() - began
-            )
+    def where(k: int) -> str:
+        return f"step {k + 1} of {len(steps)}, {steps[k].name}"
+
+    # The planned motions: number of the step, the workspace and the results before it, and its alternatives.
+    # This is a list, since a recursion with one call per step has a limit.
+    planned = list[tuple[int, Any, tuple[PlanResult | None, ...], Iterator[PlanResult]]]()
+    results: tuple[PlanResult | None, ...] = ()
+    q = checked_configuration(space.robot, "start", start, [])
+    k = 0
+    while k < len(steps):
         step = steps[k]
-        where = f"step {k + 1} of {len(steps)}, {step.name}"
         if isinstance(step, Attach | Detach):
             space = copy(space)
-            with located(where):
+            with located(where(k)):
                 if isinstance(step, Attach):
                     space.attach(step.obstacle, q, step.link, step.touch_links)
                 else:
                     space.detach(step.held, q)
-            return planned(k + 1, space, q, (*results, None))
-        alternatives = motions(k, space, q)
+            results = (*results, None)
+            k += 1
+            continue
+        planned.append((k, space, results, motions(k, space, q)))
+        over = False
         while True:
-            with located(where):
-                result = next(alternatives, None)
-            if result is None:
-                return None
-            if not result.solved:
-                if len(results) >= len(furthest.results):
-                    reason = f"{where}: {result.reason}"
-                    furthest = StepsResult(tuple(steps), (*results, result), space, reason, 0.0)
-                return None
-            outcome = planned(k + 1, space, result.path.positions[-1], (*results, result))
-            if outcome is not None or clock() - began > time_limit:
-                return outcome
-            tried_ends += 1
-
-    with located("start"):
-        q = Problem(space.robot, Scene(), start, start).start
-    outcome = planned(0, space, q, ())
-    if outcome is None:
-        attempts_text = f"; {tried_ends} ends of earlier steps were tried" if tried_ends > 1 else ""
-        outcome = replace(furthest, reason=furthest.reason + attempts_text, planning_time=clock() - began)
-    return outcome
+            k, space, results, alternatives = planned[-1]
+            with located(where(k)):
+                result = None if over else next(alternatives, None)
+            if result is not None and result.solved:
+                break
+            if result is not None and len(results) >= len(furthest.results):
+                reason = f"{where(k)}: {result.reason}"
+                furthest = StepsResult(tuple(steps), (*results, result), space, reason, 0.0)
+            planned.pop()
+            if not planned:
+                attempts_text = f"; {tried_ends} ends of earlier steps were tried" if tried_ends > 1 else ""
+                reason = furthest.reason + attempts_text
+                return replace(furthest, reason=reason, planning_time=clock() - began)
+            tried_ends += isinstance(steps[planned[-1][0]], MoveTo)
+            over = clock() - began > time_limit
+        results = (*results, result)
+        q = result.path.positions[-1]
+        k += 1
+    return StepsResult(tuple(steps), results, space, f"solved in {counted(k, 'step')}", clock() - began)
 
 
 def _goal_ends(problem: Problem) -> list[tuple[int, Configuration]]:
@@ -288,8 +315,7 @@ def _goal_ends(problem: Problem) -> list[tuple[int, Configuration]]:
     ends = list[tuple[int, Configuration]]()
     for i, goal in enumerate(goals):
         if isinstance(goal, PoseGoal) and not goal.tolerant:
-            rows = problem.robot.ik(goal.T_base_frame, goal.frame, near=problem.start)
-            ends += [(i, row) for row in rows]
+            ends += [(i, row) for row in problem.robot.ik(goal.T_base_frame, goal.frame, near=problem.start)]
         elif isinstance(goal, JointGoal):
             single_goal = len(goals) == 1
             ends += [(j if single_goal else i, row) for j, row in enumerate(goal.positions)]
@@ -321,19 +347,32 @@ class Workspace:
             T_world_base: Pose of the robot's base [4, 4]; None: the base is at the origin of the world.
 
         Raises:
-            InputError: For an unknown link, and a pose that is not rigid.
+            InputError: For anything but a robot, an unknown link, and a pose that is not rigid.
         """
         check_robot(robot)
         self.robot = robot
         """The robot with its held objects."""
         self.tip = robot.tip if tip is None else tip
         robot.link_frame(self.tip)
-        base = np.eye(4) if T_world_base is None else rigid_transform("T_world_base", T_world_base)
-        self.T_world_base: ndarray = base
-        """Pose of the base in the world."""
-        self._T_base_world = inverse(base)
+        self._T_world_base = np.eye(4)
         self.scene = Scene()
         """The obstacles, in the frame of the base."""
+        self.T_world_base = np.eye(4) if T_world_base is None else T_world_base  # type: ignore[assignment]
+
+    @property
+    def T_world_base(self) -> ndarray:
+        """Pose of the base in the world. If it is set, obstacles stay where they are in the world."""
+        return self._T_world_base
+
+    @T_world_base.setter
+    def T_world_base(self, T_world_base: ArrayLike) -> None:
+        base = rigid_transform("T_world_base", T_world_base)
+        base.setflags(write=False)
+        T_base_world = inverse(base)
+        if self.scene.shapes:
+            self.scene = self.scene.moved(T_base_world @ self._T_world_base)
+        self._T_world_base = base
+        self._T_base_world = T_base_world
 
     @property
     def obstacles(self) -> tuple[str, ...]:
@@ -347,10 +386,16 @@ class Workspace:
             shapes: Shapes, meshes or point clouds with different names, in the frame of the world.
 
         Raises:
-            InputError: For anything but shapes, and for two shapes with equal names.
+            InputError: For anything but shapes, two shapes with equal names, and a shape with the name of a
+                held object.
         """
         new = Scene(shapes).moved(self._T_base_world).shapes
         names = [shape.name for shape in new]
+        for body in self.robot.attached:
+            if body.name in names:
+                raise InputError(
+                    f"a shape is named {body.name}, as an object that the robot holds; rename it"
+                )
         if names != [shape.name for shape in shapes]:
             raise InputError(
                 f"shapes are named {', '.join(shape.name for shape in shapes)}; names must differ"
@@ -414,13 +459,12 @@ class Workspace:
             touch_links: Further links that it may touch while it is held.
 
         Raises:
-            InputError: For an unknown name, q of the wrong length or out of limits, a point cloud or height
-                map, and a link that no planned joint moves.
+            InputError: For an unknown name, q of the wrong length or out of limits, and in the cases in which
+                `Robot.attach` raises it.
         """
         self._obstacle(name)
-        at = self._configuration(q)
         self.scene, self.robot = self.scene.attach(
-            name, self.robot, at, self.tip if link is None else link, touch_links
+            name, self.robot, self._configuration(q), self.tip if link is None else link, touch_links
         )
 
     def detach(self, name: str, q: AnyConfiguration) -> None:
@@ -431,8 +475,8 @@ class Workspace:
             q: Configuration at which it is released [dof], values by joint, or the name of a pose.
 
         Raises:
-            InputError: For an unknown name, q of the wrong length or out of limits, and an object that holds
-                another one.
+            InputError: For an unknown name, q of the wrong length or out of limits, an object that holds
+                another one, and an object that is no shape.
         """
         self.scene, self.robot = self.scene.detach(name, self.robot, self._configuration(q))
 
@@ -463,7 +507,8 @@ class Workspace:
             Distinct configurations [k, dof]; no rows if none was found.
 
         Raises:
-            InputError: For a pose that is not rigid, `near` of the wrong length, and a count below 1.
+            InputError: For a pose that is not rigid, `near` of the wrong length, a count below 1, and a tip
+                that no planned joint moves.
         """
         T = self._T_base_world @ rigid_transform("pose", pose)
         return self.robot.ik(T, self.tip, near=near, count=count)
@@ -478,9 +523,9 @@ class Workspace:
             A value that is true if the arm is free; otherwise its `reason` says why not.
 
         Raises:
-            InputError: For q of the wrong length, and for an unknown name.
+            InputError: For q of the wrong length, an unknown name, and values that lack a planned joint.
         """
-        return self._problem(self.scene).is_free(q)
+        return self._problem_at_rest().is_free(q)
 
     def clearance(self, q: ArrayLike) -> float | ndarray:
         """Lower bound of the distance to obstacles and between links; see `Problem.clearance_at`.
@@ -492,9 +537,9 @@ class Workspace:
             The bound [m], one for each row.
 
         Raises:
-            InputError: For q of the wrong shape.
+            InputError: For q of the wrong shape, and numbers that are not finite or beyond ±1e4.
         """
-        return self._problem(self.scene).clearance_at(q)
+        return self._problem_at_rest().clearance_at(q)
 
     def plan(
         self,
@@ -521,7 +566,7 @@ class Workspace:
             InputError: For what `rd.Problem` or `rd.plan` does not accept.
         """
         began = clock()
-        problem = Problem(self.robot, self.scene, start, self._goal(goal), constraints=constraints)
+        problem = self._problem(start, self._goal(goal), constraints)
         return plan(problem, time_left(time_limit, began), **request)
 
     def plan_steps(
@@ -542,7 +587,8 @@ class Workspace:
             A result with a verified motion for each step, or with the step that failed and the reason.
 
         Raises:
-            InputError: For a step with wrong input; the message names the step.
+            InputError: For a step with wrong input (the message names the step), for anything but a list of
+                steps, a wrong start, and what `rd.plan` does not accept.
 
         Examples:
             >>> space = rd.Workspace(rd.load_robot("panda"))
@@ -567,9 +613,10 @@ class Workspace:
         """Plan a motion of the tip along a straight line, with an evenly turning orientation.
 
         Args:
-            pose: End of the line: T_world_tip [4, 4], or a goal in the frame of the base. For a `rd.PoseGoal`
-                with tolerances, the line ends at a pose within them that is near to the pose at the start.
-                For a `rd.AnyGoal`, lines to the goals are tried until one is found, nearest goal first.
+            pose: End of the line: T_world_tip [4, 4]; or a `rd.PoseGoal`, `rd.JointGoal`, `rd.PosesGoal` or
+                `rd.AnyGoal`, in the frame of the base. For a `rd.PoseGoal` with tolerances, the line ends at
+                a pose within them that is near to the pose at the start. For a `rd.AnyGoal`, lines to the
+                goals are tried until one is found, nearest goal first.
             start: Start configuration [dof], values by joint, or the name of a pose.
             tolerance: Largest distance of the tip from the line [m].
             angle: Largest deviation from the evenly turning orientation [rad]; None: any orientation on the
@@ -587,7 +634,8 @@ class Workspace:
             with the largest `fraction`.
 
         Raises:
-            InputError: For what `rd.Problem`, `rd.CartesianLine` or `rd.plan` does not accept.
+            InputError: For what `rd.Problem`, `rd.CartesianLine` or `rd.plan` does not accept, and for
+                several poses [n, 4, 4].
         """
         from robotdiffuse.problems.compiled_constraints import line_end  # compiled code
 
@@ -618,12 +666,12 @@ class Workspace:
                 "or give a rd.AnyGoal to reach any one pose"
             )
         goals = pose.goals if several else [pose]
-        if not isinstance(pose, AnyGoal | PoseGoal):
+        if not isinstance(pose, Goal):
             goals = [self._goal(rigid_transform("pose", pose))]
         q = self._configuration(start)
         goals = [self._exact(goal, q) if isinstance(goal, PoseGoal) else goal for goal in goals]
-        problems = [Problem(self.robot, self.scene, start, goal, constraints=[line]) for goal in goals]
-        T_start = self._T_base_world @ self.pose(start)
+        problems = [self._problem(start, goal, [line]) for goal in goals]
+        T_start = self.robot.fk(q, self.tip)
         distances = [np.linalg.norm((line_end(problem, line) - T_start)[:3, 3]) for problem in problems]
         best = None
         for attempt, i in enumerate(np.argsort(distances, kind="stable")):
@@ -656,18 +704,25 @@ class Workspace:
             return AnyGoal(tuple(self._goal(T) for T in matrices))
         if matrices is None or matrices.shape != (4, 4):
             return goal
+        # four configurations of four joints have this shape too; a transposed pose is refused below
+        ends = matrices[3], matrices[:, 3]
+        if self.robot.dof == 4 and not any(np.array_equal(end, [0, 0, 0, 1]) for end in ends):
+            return goal
         return PoseGoal(self.tip, self._T_base_world @ rigid_transform("goal", goal))
 
     def _configuration(self, q: AnyConfiguration) -> ndarray:
         return checked_configuration(self.robot, "q", q, [])
 
-    def _problem(self, scene: Scene) -> Problem:
+    def _problem(self, start: AnyConfiguration, goal: Any, constraints: Sequence[Constraint] = ()) -> Problem:
+        base = self.T_world_base if (self.T_world_base != np.eye(4)).any() else None
+        return Problem(self.robot, self.scene, start, goal, constraints=constraints, T_world_base=base)
+
+    def _problem_at_rest(self) -> Problem:
         """A problem that is used for its scene only; its start and goal are placeholders."""
         middle = 0.5 * (self.robot.lower + self.robot.upper)
-        return Problem(self.robot, scene, middle, middle)
+        return self._problem(middle, middle)
 
     def _obstacle(self, name: str) -> Shape:
-        for shape in self.scene.shapes:
-            if shape.name == name:
-                return shape
-        raise unknown_name("obstacle", name, self.obstacles)
+        obstacles = {shape.name: shape for shape in self.scene.shapes}
+        check_name("obstacle", name, obstacles)
+        return obstacles[name]

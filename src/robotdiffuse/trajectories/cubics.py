@@ -94,12 +94,12 @@ class Cubics:
         """
         times = self.trajectory.times
         q = self.trajectory.positions
-        chords = self.extremes.chord
+        step_bounds = self.extremes.chord
         joint_bounds = self.extremes.chords
-        if chords.max(initial=0.0) <= chord:
+        if step_bounds.max(initial=0.0) <= chord:
             return times, q, joint_bounds
         # if a step is divided, its bound falls with the square of the number of parts
-        counts = np.ceil(np.sqrt(chords / chord)).astype(int)
+        counts = np.ceil(np.sqrt(step_bounds / chord)).astype(int)
         counts = np.maximum(counts, 1)
         step = np.repeat(np.arange(len(counts)), counts)
         share = np.concatenate([np.arange(n) / n for n in counts])

@@ -6,11 +6,9 @@ which cuts corners; here the place s on the curve is averaged, so that the motio
 """
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 from scipy.interpolate import CubicSpline
 
-from robotdiffuse.core.types import Trajectory, spline_rows
+from robotdiffuse.core.types import Configurations, Trajectory, spline_rows
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.speed_limits import (
     NO_EXTRA_LIMITS,
@@ -37,7 +35,7 @@ longer. With lower accelerations, the jerk limits need a shorter averaging windo
 
 def time_curve(
     robot: Robot,
-    waypoints: Float[ndarray, "n dof"],
+    waypoints: Configurations,
     settings: TimingSettings,
     extra: ExtraLimits = NO_EXTRA_LIMITS,
 ) -> Trajectory:

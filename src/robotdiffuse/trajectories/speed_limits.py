@@ -97,7 +97,8 @@ class TimingSettings(Settings, name="timing"):
     """Smallest number of grid intervals in a rounded corner; a long corner has as many as a straight part of
     the same length."""
     line_intervals: Count = 64
-    """Number of grid intervals of the whole motion, distributed by length."""
+    """Number of grid intervals of each motion from stop to stop, distributed by length; more where short
+    parts get their smallest numbers of intervals."""
 
 
 DEFAULT = TimingSettings()
@@ -256,9 +257,11 @@ def _moving_start(robot: Robot, line: RoundedLine, settings: TimingSettings, sta
     return best
 
 
-def stopping_distance(robot: Robot, settings: TimingSettings, velocity: JointValues) -> float:
+def stopping_distance(
+    robot: Robot, settings: TimingSettings, velocity: JointValues, room: float = np.inf
+) -> float:
     """Length of a straight line in the direction of `velocity` on which a motion that begins with this
-    velocity can stop [rad, joint-space L2]."""
+    velocity can stop [rad, joint-space L2]. At most `room`, unless the motion needs more to stop."""
     acceleration = scaled_limits(robot, settings)[1]
     speed = float(np.linalg.norm(velocity))
     moving = velocity != 0
@@ -267,12 +270,12 @@ def stopping_distance(robot: Robot, settings: TimingSettings, velocity: JointVal
     delays = [0.5 * share * window + 2 * settings.sample_time for share in START_SHARES]
     braking = [speed**2 / (2 * BRAKING_FRACTION * share * max_acceleration) for share in START_SHARES]
     shortest = min(speed * delay + length for delay, length in zip(delays, braking, strict=True))
-    return max(shortest, MIN_STOPPING_DISTANCE)
+    return max(shortest, min(MIN_STOPPING_DISTANCE, room))
 
 
 def jerk_windows(step: float, acceleration: JointValues, jerk: JointValues) -> list[int]:
-    """Windows for `spline_rows` to try, in increasing order [configurations, which are `step` s apart]. The
-    last window keeps the jerk limits of any motion within the acceleration limits."""
+    """Windows for `spline_rows` to try, in increasing order: numbers of configurations that are `step` [s]
+    apart. The last window keeps the jerk limits of any motion within the acceleration limits."""
     jerk_window = max(int(np.ceil(2 * (acceleration / jerk).max() / step)), 1)
     return sorted({1, *(int(np.ceil(fraction * jerk_window)) for fraction in WINDOW_FRACTIONS), jerk_window})
 

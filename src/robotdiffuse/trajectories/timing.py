@@ -36,8 +36,8 @@ from robotdiffuse.trajectories.speed_limits import (
 from robotdiffuse.trajectories.timing_kernel import line_with_widths, rounded_line
 
 SHRINK_FACTOR = 0.5
-"""Factor by which the deviation of a corner (how far its rounding may leave the path) shrinks each time the
-rounding is refused; also the factor by which accelerations are lowered instead, see MAX_SLOWER_TIMINGS."""
+"""Each time that a rounding is refused, the deviation of the corner (how far its rounding may leave the path)
+shrinks by this factor, or accelerations are lowered by it instead; see MAX_SLOWER_TIMINGS."""
 MIN_DEVIATION = 2e-4
 """A corner that cannot be rounded with this deviation is a stop [rad, joint-space L2]."""
 MAX_TIMINGS = 8
@@ -123,7 +123,7 @@ def time_parameterize(
     deviations = _shrunk(waypoints, allowed[1:-1], keeps, MIN_DEVIATION)
     while start_speed and deviations[:1].any():
         stop = np.append(np.flatnonzero(deviations == 0), len(deviations))[0]
-        try:  # can the motion, which has its start speed, pass the corners before its first stop?
+        try:  # can a motion that begins with the start speed pass the corners before its first stop?
             _time_segments(robot, path, waypoints[: stop + 2], deviations[:stop], settings, start_speed)
             break
         except TooFastError:
@@ -298,8 +298,7 @@ class StopGraph:
         widths = line.half_widths
         stops = [0.0, *corners[deviations == 0], length]
         for s in np.linspace(0.0, length, PATH_PARTS + 1)[1:-1]:
-            within = np.flatnonzero(np.abs(s - corners) < widths)
-            for i in within[:1]:
+            for i in np.flatnonzero(np.abs(s - corners) < widths)[:1]:
                 s = corners[i] + np.copysign(widths[i], s - corners[i])
             if min(abs(s - stop) for stop in stops) > MIN_DISTANCE:
                 stops.append(float(s))
@@ -339,8 +338,7 @@ class StopGraph:
         """For each tick of a motion, from its start to its end, the index of the nearest configuration among
         `configurations`."""
         times, q = motion.rows[:2]
-        ticks = self.step * np.arange(motion.ticks + 1)
-        at = interpolated(ticks, times, q)
+        at = interpolated(self.step * np.arange(motion.ticks + 1), times, q)
         # squared distances, without the term that is the same for all configurations
         return ((configurations**2).sum(axis=1) - 2 * at @ configurations.T).argmin(axis=1)
 
@@ -348,8 +346,7 @@ class StopGraph:
         """The trajectory of motions one after the other; an integer in `motions` is a wait of one time
         step."""
         q = self.line(self.stops[:1], 0)
-        a = motions[0].rows[3][:1] if motions and not isinstance(motions[0], int) else 0 * q
-        segments = [(np.zeros(1), q, 0 * q, a)]
+        segments = [(np.zeros(1), q, 0 * q, 0 * q)]  # motions begin and end without acceleration
         for part in motions:
             if isinstance(part, int):
                 q = np.repeat(segments[-1][1][-1:], 2, axis=0)

@@ -21,9 +21,9 @@ from robotdiffuse.core.types import Configurations, JointRows, Values
 SLOWDOWN_CHECKS_PER_INTERVAL = 16
 """Number of equal parts of a grid interval at the ends of which `slowdown` checks limits. With 4 parts, one
 joint exceeded its limit by 1.8 % where it reversed its direction."""
-# Factors on velocities and accelerations before `slowdown` compares them with limits. CURVE_MARGIN is for
-# rounded corners, where rates between the checked values of s were up to 0.025 % greater; ROUNDING_MARGIN is
-# for straight lines. Accelerations get the square of a factor.
+# Factors on velocities before `slowdown` compares them with limits; accelerations get the square of a factor.
+# CURVE_MARGIN is for rounded corners, where rates between the checked values of s are slightly greater;
+# ROUNDING_MARGIN is for straight lines.
 CURVE_MARGIN = 1.0002
 ROUNDING_MARGIN = 1 + 1e-9
 START_SLACK = 1e-7
@@ -352,8 +352,9 @@ def fastest_speeds(first, second, grid, velocity, lowest, highest, start_speed=0
         speeds[i] = np.sqrt(x)
         width = grid[i + 1] - grid[i]
         high, slope = _bounds_of_next(first, second, i, width, x, max_x[i + 1], lowest, highest)[2:4]
-        # Rounding errors must not stop the motion, so the next x is at least the one that the backward pass
-        # made possible: this fraction of max_x[i] from there, and proportionally less from a smaller x.
+        # Rounding errors must not stop the motion. From max_x[i], the backward pass made a next x possible of
+        # MIN_SPEED_RATIO times the smaller one of max_x[i] and max_x[i + 1]; from a smaller x, the next x is
+        # at least proportionally less.
         min_next = MIN_SPEED_RATIO * x * min(1.0, max_x[i + 1] / max_x[i])
         x = min(max(high + slope * x, min_next), max_x[i + 1])
     return speeds

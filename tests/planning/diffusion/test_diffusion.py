@@ -34,8 +34,7 @@ def test_the_answer_is_the_shortest_valid_sample_as_it_was_drawn() -> None:
     paths = [rd.Path(PANDA.joint_names, q) for q in samples]
     valid = [path for path in paths if rd.verify(PROBLEM, path).valid]
     assert valid and result.stage == "network"
-    shortest = min(valid, key=lambda path: path.length)
-    assert np.array_equal(result.path.positions, shortest.positions)
+    assert np.array_equal(result.path.positions, min(valid, key=lambda path: path.length).positions)
     assert f"{len(valid)} of {len(samples)} samples" in result.reason
 
 

@@ -161,8 +161,7 @@ def test_start_velocities_are_within_the_limits_or_rest() -> None:
 
 @pytest.mark.parametrize(("first", "jerk"), [(PANDA.upper[0] - 0.01, None), (START[0], 0.1)])
 def test_a_start_velocity_that_cannot_stop_is_invalid(first: float, jerk: float | None) -> None:
-    start = np.array([first, *START[1:]])
-    task = rd.Problem(PANDA, rd.Scene(), start, GOAL, start_velocity=np.eye(7)[0] * 2.0)
+    task = rd.Problem(PANDA, rd.Scene(), np.array([first, *START[1:]]), GOAL, start_velocity=np.eye(7)[0] * 2.0)
     found = rd.load_planner("rrt_connect").plan(task, jerk=jerk)
     assert found.status is rd.Status.INVALID_START
     assert "panda_joint1 cannot stop" in found.reason

@@ -11,7 +11,7 @@ from numpy import ndarray
 import robotdiffuse as rd
 from robotdiffuse.core.types import FIRST
 from robotdiffuse.learning.completion import predict
-from robotdiffuse.perception import unknown_space as assumptions
+from robotdiffuse.perception import occupancy_map as assumptions
 from robotdiffuse.perception.depth_view import SeenPoints
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
@@ -85,7 +85,7 @@ def test_of_several_motions_the_one_that_sweeps_least_probability(planner: Plann
 
 def test_the_unknown_region_is_found_for_the_chosen_motion_only(planner: Planner, monkeypatch: pytest.MonkeyPatch) -> None:
     counted = Mock(wraps=heaviest_part)
-    monkeypatch.setattr("robotdiffuse.perception.unknown_space.heaviest_part", counted)
+    monkeypatch.setattr("robotdiffuse.perception.occupancy_map.heaviest_part", counted)
     everywhere = np.full(FINE.shape, np.float32(0.01))
     result = unknown_space.plan_with_unknown_space(planner, partial("predicted"), PlanRequest(20.0, until=FIRST), everywhere)
     assert result.unknown_region is not None and counted.call_count == 1

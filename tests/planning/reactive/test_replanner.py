@@ -14,7 +14,7 @@ import robotdiffuse as rd
 from helpers.panda import GOAL, PANDA, START
 from helpers.refusals import refuses
 from robotdiffuse.collision.moving_obstacles import MovingCollision
-from robotdiffuse.planning.reactive.timed_path import JerkFilter, SpeedProfile, TimedPath
+from robotdiffuse.planning.reactive.replanner import JerkFilter, SpeedProfile, TimedPath
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.trajectories.speed_limits import jerk_limits
 from robotdiffuse.trajectories.timing_kernel import rounded_line
@@ -166,6 +166,16 @@ def test_replanners_that_cannot_begin() -> None:
         ({"payload": rd.Payload(0.5, link="panda_hand")}, r"does not support problem\.payload"),
     ):
         refuses(message, rd.Replanner, replace(problem, **fields))
+
+
+def test_a_wound_up_arm_is_where_it_rests() -> None:
+    """Regression: if a continuous joint began beyond half a turn, no goal was ever reached."""
+    gen3 = rd.load_robot("gen3")
+    q, goal = ([wound, 0.3, 0.0, -1.2, 0.0, 0.9, 0.0] for wound in (2 * np.pi, 2 * np.pi + 0.2))
+    ball = rd.MovingObstacle(rd.Sphere([0.0, -3.0, 0.5], 0.1), max_speed=SPEED)
+    replanner = rd.Replanner(rd.Problem(gen3, rd.Scene(), q, goal, moving=[ball]))
+    replanner.set_goal(q)
+    assert replanner.step({"sphere": [0.0, -3.0, 0.5]}, 0.0).arrived
 
 
 @pytest.mark.parametrize("goal", ["start", "pose", "here"])

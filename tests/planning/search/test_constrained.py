@@ -62,8 +62,7 @@ def test_speed_of_a_line_is_kept_and_used() -> None:
     result = rd.load_planner("aorrtc").plan(problem([LINE]), time_limit=20.0)
     assert result.trajectory is not None, result.reason
     t = result.trajectory
-    at = PANDA.fk(t.positions, HAND)[:, :3, 3]
-    speeds = np.linalg.norm(np.diff(at, axis=0), axis=1) / np.diff(t.times)
+    speeds = np.linalg.norm(np.diff(PANDA.fk(t.positions, HAND)[:, :3, 3], axis=0), axis=1) / np.diff(t.times)
     assert speeds.max() <= 0.25 * 1.001 and np.median(speeds) >= 0.24
     found = rd.verify(problem([replace(LINE, speed=0.2)]), t).violation
     assert found.kind == "speed" and "allows 0.2 m/s" in found.message

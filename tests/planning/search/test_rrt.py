@@ -20,7 +20,7 @@ from robotdiffuse.collision.motions import search_space
 from robotdiffuse.planning import context, start_goal
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.planning.search.rrt import AORRTC, AORRTCSettings, RRTConnect
-from robotdiffuse.problems.held_out import held_out_problem
+from robotdiffuse.problems.files import held_out_problem
 from robotdiffuse.trajectories.simplification import simplify, tighten
 from robotdiffuse.trajectories.timing import Timing, time_parameterize
 
@@ -49,8 +49,7 @@ def test_paths_are_below_the_bound_and_join_the_ends() -> None:
             parents = trees.parents[tree, :size]
             costs = trees.costs[tree, :size]
             for n in np.flatnonzero(parents >= 0):
-                step = np.linalg.norm(nodes[n] - nodes[parents[n]])
-                assert costs[n] == pytest.approx(costs[parents[n]] + step, abs=1e-3)
+                assert costs[n] == pytest.approx(costs[parents[n]] + np.linalg.norm(nodes[n] - nodes[parents[n]]), abs=1e-3)
         bound = np.float32(path_length(path))
         found = found + 1
     assert found >= 3
@@ -106,17 +105,13 @@ def test_the_clearance_is_kept_or_a_note_says_otherwise() -> None:
     assert narrow.solved and any("clearance of 30 cm" in note for note in narrow.notes)
 
 
-def test_scaled_motions_and_those_with_a_limit_of_jerk_are_slower() -> None:
+def test_limits_slow_motions_down_and_gain_zero_does_not_end_the_search() -> None:
     asked = {}, {"velocity_scaling": 0.5, "acceleration_scaling": 0.25}, {"jerk": 100.0}
     free, half, gentle = (AORRTC().plan(AROUND, 20.0, until="first", **one).trajectory for one in asked)
     assert half.duration == pytest.approx(2 * free.duration, rel=0.01)
-    rates = np.diff(gentle.accelerations, axis=0) / np.diff(gentle.times)[:, None]
-    assert np.abs(rates).max() <= 100.0 * (1 + 1e-6)
+    assert np.abs(np.diff(gentle.accelerations, axis=0) / np.diff(gentle.times)[:, None]).max() <= 100.0 * (1 + 1e-6)
     assert free.duration < gentle.duration < 2 * free.duration
-
-
-def test_gain_zero_does_not_end_the_search() -> None:
-    """Regression: with `gain` 0 the search stopped at once if there was no path at half the work."""
+    # Regression: with `gain` 0 the search stopped at once if there was no path at half the work.
     result = AORRTC(AORRTCSettings(gain=0.0, patience=0)).plan(AROUND, 1.0)
     assert result.solved and len(result.progress) > 1
 

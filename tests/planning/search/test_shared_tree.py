@@ -45,8 +45,7 @@ def grid_optimum(checker: CollisionChecker, start: np.ndarray, goal: np.ndarray,
         for t in np.arange(1, max(abs(i), abs(j))) / max(abs(i), abs(j)):
             a = round(t * i)
             b = round(t * j)
-            middle = np.s_[max(0, -i) + a : cells - max(0, i) + a, max(0, -j) + b : cells - max(0, j) + b]
-            open_ = open_ & free[middle]
+            open_ = open_ & free[np.s_[max(0, -i) + a : cells - max(0, i) + a, max(0, -j) + b : cells - max(0, j) + b]]
         a, b = number[here][open_], number[there][open_]
         edges.append((np.full(len(a), h * np.hypot(i, j)), a, b))
     lengths, rows, columns = map(np.concatenate, zip(*edges, strict=True))
@@ -215,7 +214,7 @@ def test_a_gap_too_narrow_for_the_distance_lowers_it() -> None:
     assert search.safety_distance == pytest.approx(0.01) and search.cost == pytest.approx(1.8)
 
 
-def test_no_way_ends_at_the_time_limit_or_when_it_was_searched_for_at_every_distance() -> None:
+def test_what_ends_a_search_without_a_path() -> None:
     walls = [rd.Box([side * 0.65, 0.0, 0.5], [1.0, 0.02, 3.0]) for side in (1, -1)]
     sealed = rd.Scene([*walls, rd.Box([0.0, 0.0, 1.35], [3.0, 0.02, 1.3])])
     problem = rd.Problem(PANDA, sealed, LEFT, rd.JointGoal(RIGHT[None]))
@@ -223,9 +222,6 @@ def test_no_way_ends_at_the_time_limit_or_when_it_was_searched_for_at_every_dist
         settings = shared_tree.SharedTreeSettings(step_rounds=step_rounds, growth=10, connect_iterations=10)
         result = shared_tree.SharedTreeRRTStar(settings).plan(problem, time_limit=limit)
         assert result.status is status and result.path is None and result.reason
-
-
-def test_the_number_of_rounds_ends_a_search_without_a_path_and_without_patience():
     settings = replace(TOUCHING, growth=1, connect_iterations=1, step_rounds=1, rounds=5)
     search = SharedTreeSearch(CollisionChecker(PANDA, WALL), LEFT, RIGHT[None], settings, random_state(0))
     search.run()

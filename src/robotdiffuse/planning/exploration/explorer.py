@@ -1,17 +1,17 @@
 """Explorer: takes an arm to goals through space that cameras see on the way.
 
 An Explorer returns steps. Steps of the kind `look` move the arm to a viewpoint, where the caller takes
-an image. Motions follow one of two policies.
+an image. Motions follow one of two policies, or the first and then the second.
 
 **Strict.** The arm enters only voxels that were seen free: the validator accepts each motion among obstacles
-that cover all other space (`seen_free.py`). There are two exceptions: voxels with centers within 3 cm of the
-arm at the start of the motion, and the space within 2 cm of the arm at the end of the motion. Seen points are
-obstacles even there. With `see_goal`, the arm's surface at the goal must also have been seen free
-(`seen_free.GoalSeen`). The promise is as good as the map: if the scene does not change, and the camera's
-poses and errors are as stated, such a motion does not collide. Seen points may be displaced by the error of
-their camera's pose, and an obstacle may be anywhere within this error of a seen point. This space counts as
-free only if some view shows it free for every camera pose within the error of that view's pose. Views from
-nearby can show this.
+that cover all other space (`viewpoints.py`). Besides `free_zone`, there are two exceptions: voxels with
+centers within 3 cm of the arm at the start of the motion, and, for motions to the goal or on the way back,
+the space within 2 cm of the arm at their end. Seen points are obstacles even there. With `see_goal`, the
+arm's surface at the goal must also have been seen free (`viewpoints.GoalSeen`). The promise is as good as the
+map: if the scene does not change, and the camera's poses and errors are as stated, such a motion does not
+collide. Seen points may be displaced by the error of their camera's pose, and an obstacle may be anywhere
+within this error of a seen point. This space counts as free only if some view shows it free for every camera
+pose within the error of that view's pose. Views from nearby can show this.
 
 **Probabilistic.** The arm executes a motion whose stated `confidence` is high enough, and otherwise looks
 first. The confidence follows from the predicted occupancy probabilities of the unknown voxels that the motion
@@ -20,38 +20,51 @@ sweeps, except voxels that the arm fills at the start or at the goal.
 To choose a viewpoint, the Explorer plans a tentative motion to the goal among only the seen obstacles. Views
 should show the unseen space that this motion would sweep. The motion to a viewpoint is subject to the policy
 as well. Under the probabilistic policy, a strict motion to the viewpoint is tried first.
+
+A motion under way is stopped before an obstacle that appears in its way. The stop follows the path of the
+motion, slower and slower until the arm rests. So it passes only configurations that were validated when the
+motion was planned; they are validated again among the obstacles that were seen since then.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
-from itertools import islice
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import islice, product
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import BSpline
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
-from robotdiffuse.core.errors import InputError, check_type, counted, vector
+from robotdiffuse.core.errors import InputError, check_type, counted, joined, shown, vector
 from robotdiffuse.core.locked import locked
-from robotdiffuse.core.settings import Natural, converted
-from robotdiffuse.core.types import FIRST, Configuration, Configurations, Path, PlanResult, Status, Trajectory
+from robotdiffuse.core.settings import Natural, Number, converted
+from robotdiffuse.core.types import (
+    FIRST,
+    Configuration,
+    Configurations,
+    Path,
+    PlanResult,
+    Status,
+    Trajectory,
+)
 from robotdiffuse.perception.camera_check import contradiction, implausible
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.occupancy_map import Corners, OccupancyMap, ViewMemory
+from robotdiffuse.perception.occupancy_map import (
+    APPEARED_PADDING,
+    EXPLORED,
+    Corners,
+    OccupancyMap,
+    UnknownSpace,
+    ViewMemory,
+    lost_regions,
+    probability_free,
+)
 from robotdiffuse.perception.pose_refinement import PoseRefinement, is_on
-from robotdiffuse.perception.seen_points import point_shapes
-from robotdiffuse.perception.unknown_space import EXPLORED, UnknownSpace, lost_regions, probability_free
+from robotdiffuse.perception.seen_points import point_shapes, seen_shapes
 from robotdiffuse.perception.voxel_grid import LAYERS_BELOW, MAP, Probabilities, Voxels, surface
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
-from robotdiffuse.planning.exploration.seen_free import (
-    GoalSeen,
-    cover,
-    hardly_seen,
-    least_unknown,
-    near_ends,
-    not_seen_free,
-    reaches_outside,
-)
 from robotdiffuse.planning.exploration.steps import (
     DONE,
     GO,
@@ -64,21 +77,147 @@ from robotdiffuse.planning.exploration.steps import (
     ExplorerSettings,
     Step,
 )
-from robotdiffuse.planning.exploration.stopping import Stop, stop_before
 from robotdiffuse.planning.exploration.viewpoints import (
     CONFINED,
+    GoalSeen,
     ReachableTree,
     best_viewpoints,
+    cover,
     first_parts,
+    hardly_seen,
+    least_unknown,
     moved,
+    near_ends,
+    not_seen_free,
+    reaches_outside,
     swept_unseen,
 )
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import PADDED, PREDICTED, Goal, JointGoal, Problem
 from robotdiffuse.robots.robot import Robot, check_robot
-from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene import Scene, added
+from robotdiffuse.scenes.shapes import PointCloud
+from robotdiffuse.trajectories.speed_limits import jerk_limits
 from robotdiffuse.validation.tolerances import VerifySettings, goal_error
+from robotdiffuse.validation.validator import verifier
+
+ROW_TIME = 0.004
+"""Largest time between the rows while a stop brakes [s]."""
+LEAST_STEP = 1e-3
+"""Smallest time between the rows of a stop [s]; a stop takes at least this long."""
+DELAY_STEP = 0.02
+"""Step between the times at which braking may begin [s]."""
+BRAKING_TIMES = 0.05 * 1.12 ** np.arange(35)
+"""Durations of braking that are tried, the shortest first [s]."""
+RAMPS = (0.1, 0.25, 0.5)
+"""Fractions of the braking time that are tried for the rise of the deceleration, and for its fall."""
+LIMIT_TOLERANCE = 1e-3
+"""Accelerations and jerks may exceed their limits by this fraction of the limit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stop:
+    """How a motion ends early."""
+
+    begins: float
+    """When the stop replaces the motion, in time of the motion [s]."""
+    motion: Trajectory
+    """The stop, from this time on; it ends at rest on the path of the motion."""
+    reason: str
+    """The violation that the motion would have: what is in the way."""
+    certified: bool
+    """Whether the validator accepts the stop among all that was seen; if not, the arm cannot stop in time."""
+
+
+def stop_before(
+    robot: Robot,
+    known: Scene,
+    views: Sequence[DepthView],
+    free: Voxels,
+    motion: Trajectory,
+    time: float,
+) -> Stop | None:
+    """A stop that begins at `time` and comes to rest as early as possible, if views show an obstacle in the
+    way of the rest of the motion; otherwise None.
+
+    The stop is within the robot's limits of velocity, acceleration and jerk. Points in space that was free
+    before belong to an object that appeared; these points are padded, since only the object's front is seen.
+
+    views: views taken during the motion. free: `OccupancyMap.free` when the motion was planned. time: when a
+    new command takes effect, in time of the motion [s]. Raises InputError for a time outside the motion.
+    """
+    if not 0 <= time <= motion.duration:
+        raise InputError(f"time is {shown(time)}; it must be in [0, {motion.duration:.4g}] s of the motion")
+    current = motion.at(time).positions
+    end = motion.positions[-1]
+    seen = seen_shapes(views, robot, known, current, end[None])
+    points = np.concatenate([np.zeros((0, 3)), *(shape.points for shape in seen)])
+    appeared = PointCloud(points[MAP.enclose(free, points, MAP.edge)], APPEARED_PADDING, name="appeared")
+    validator = verifier(Problem(robot, added(known, [*seen, appeared]), current, end))
+    remaining = np.concatenate([current[None], motion.positions[motion.times > time]])
+    violation = validator.path(Path(robot.joint_names, remaining)).violation
+    if violation is None:
+        return None
+    stop = braked(robot, motion, time)
+    certified = validator.collision_free(Path(robot.joint_names, stop.positions))
+    return Stop(time, stop, violation.message, certified)
+
+
+def braked(robot: Robot, motion: Trajectory, time: float) -> Trajectory:
+    """The motion from `time` on, slowed to rest after as little of the path as the limits allow. It stays on
+    the path. If no braking that was tried keeps the limits, it is the rest of the motion. While the arm
+    brakes for b seconds, the clock of the motion advances by b / 2."""
+    used = motion.duration - time
+    best = _rows(motion, time, max(used, LEAST_STEP), 0.0, RAMPS[0])
+    for delay in np.arange(0.0, used, DELAY_STEP):
+        for braking, ramp in product(BRAKING_TIMES, RAMPS):
+            if delay + braking / 2 >= used:
+                break
+            candidate = _rows(motion, time, float(delay), float(braking), ramp)
+            if _within_limits(robot, candidate):
+                best = candidate
+                used = delay + braking / 2
+                break
+    return best
+
+
+def _rows(motion: Trajectory, time: float, delay: float, braking: float, ramp: float) -> Trajectory:
+    """The motion from `time` on: unchanged for `delay` [s], then slowed to rest in `braking` [s].
+
+    While braking, the motion's time passes with a speed that falls from 1 to 0. The deceleration of this
+    speed is a trapezoid: it rises for `ramp` of the braking time, is constant, and falls for `ramp`.
+    """
+    # before braking, the motion's own rows are kept: with other rows, its cubics would differ
+    after = motion.times - time
+    unchanged = after[(after > LEAST_STEP) & (after < delay - LEAST_STEP)]
+    slowed = np.linspace(delay, delay + braking, int(braking / ROW_TIME) + 2)
+    times = np.unique([0.0, *unchanged, *slowed])
+    scale = max(braking, ROW_TIME)  # `braking` is 0 if the motion does not brake
+    u = np.maximum(times - delay, 0.0) / scale
+    slowing, loss, lost_time = _braking(ramp)
+    passed = times + braking * lost_time(u)  # time of the motion
+    q, v, a, _ = motion.at(np.minimum(time + passed, motion.duration))
+    speed = 1 + loss(u)[:, None]
+    return Trajectory(motion.joint_names, times, q, v * speed, a * speed**2 + v * slowing(u)[:, None] / scale)
+
+
+@lru_cache
+def _braking(ramp: float) -> tuple[BSpline, BSpline, BSpline]:
+    """Three functions of the passed fraction of the braking time, all negative: the derivative of the speed
+    of the motion's clock, the change of this speed, and the integral of this change."""
+    peak = 1 / (1 - ramp)
+    slowing = BSpline([0, 0, ramp, 1 - ramp, 1, 1], np.array([0, -peak, -peak, 0]), 1)
+    loss = slowing.antiderivative()
+    return slowing, loss, loss.antiderivative()
+
+
+def _within_limits(robot: Robot, motion: Trajectory) -> bool:
+    start, end = motion.cubic_accelerations
+    jerks = (end - start) / np.diff(motion.times)[:, None]
+    limits = np.array([robot.acceleration, robot.acceleration, jerk_limits(robot)])
+    return bool((np.abs([start, end, jerks]) <= (1 + LIMIT_TOLERANCE) * limits[:, None]).all())
+
 
 PROBABILITY_BELOW = np.float32(0.1)
 """Assumed probability that an unknown voxel below the network's volume is occupied. About this share of the
@@ -130,6 +269,7 @@ class Explorer:
         check_type("cameras", cameras, (list, tuple), "a list of ArmCamera")
         for i, camera in enumerate(cameras):
             check_type(f"cameras[{i}]", camera, ArmCamera, "an ArmCamera")
+            robot.link_frame(camera.link)  # raises InputError for a link that the robot lacks
         check_type("scene", scene, Scene, "a Scene")
         check_type("settings", settings, ExplorerSettings, "ExplorerSettings")
         self.robot = robot
@@ -154,8 +294,8 @@ class Explorer:
         """Waypoints of the latest motion that was returned."""
         self._news: list[DepthView] = []
         """Views since the latest step."""
-        self._beside: DepthView | None = None
-        """The last view before the latest step by a camera that is not on the arm."""
+        self._fixed_view: DepthView | None = None
+        """The last view of a camera that is not on the arm, between the last two calls of `next`."""
         self._free = self.map.free
         """Voxels that were free at the latest step."""
 
@@ -181,13 +321,16 @@ class Explorer:
 
         Args:
             view: A depth image, with the pose of its camera and the configuration of the arm at the exposure.
-            stamp: Time of the exposure [s]; evidence older than the latest view by more than `max_age` is
-                forgotten.
+            stamp: Time of the exposure [s]. What a view showed is forgotten once it is older than the latest
+                view by more than `max_age`.
 
         Raises:
             InputError: For a view that does not fit the robot, whose depths are not in meters, whose
-                intrinsics do not fit its image, or that sees through the arm.
+                intrinsics do not fit its image, or that sees through the arm, and for a stamp that is no
+                finite number.
         """
+        check_type("view", view, DepthView, "an rd.DepthView")
+        stamp = converted("stamp", Number, stamp)
         q = self.map.configuration_of(view)
         wrong = implausible(view)
         if not wrong and self._camera_of(view) is None:
@@ -197,7 +340,7 @@ class Explorer:
         stated = view
         view = self._poses.observe(view)
         new_voxels = self.map.add(view, stamp)
-        self._views.add(view, new_voxels, stated)
+        self._views.add(view, new_voxels, stated, stamp, self.map.oldest)
         self._goal_seen.observe(view)
         self._news.append(view)
 
@@ -217,8 +360,8 @@ class Explorer:
         if self._goal is None:
             raise InputError("there is no goal; call set_goal first")
         q = vector("explorer", "configuration", configuration, self.robot.dof)
-        beside = [view for view in self._news if self._camera_of(view) is None]
-        self._beside = beside[-1] if beside else None
+        fixed_views = [view for view in self._news if self._camera_of(view) is None]
+        self._fixed_view = fixed_views[-1] if fixed_views else None
         self._news = []
         if goal_error(self.robot, self._goal, q, ARRIVED) is None:
             return Step(DONE, "the arm is at the goal")
@@ -227,6 +370,7 @@ class Explorer:
         goals = self._goal.positions if isinstance(self._goal, JointGoal) else q[None]
         self._views.refine(self._poses.refined)
         points, errors = self._views.points(self.map.free)
+        # free voxels within the error of a seen point count as unknown
         self.map.doubt(points, errors.sum(axis=1))
         self._free = self.map.free
         self._seed += TENTATIVE_MOTIONS  # so that the searches of each step differ
@@ -240,14 +384,12 @@ class Explorer:
             # the strict policy need not enlarge points: the map does not call space within their error free
             enlarged = policy != STRICT
             shapes = point_shapes(points, self.robot, self.scene, q, goals, errors, enlarged)
-            problem = Problem(
-                self.robot, self.scene.with_shapes([*self.scene.shapes, *shapes]), q, self._goal
-            )
+            problem = Problem(self.robot, added(self.scene, shapes), q, self._goal)
             step = replace(self._step(problem, policy), seen=problem.scene)
             if step.kind != STUCK:
                 break
         self._views_taken += step.kind == LOOK
-        if step.motion is not None and step.motion.path is not None:
+        if step.motion is not None:
             self._way_in = step.motion.path.positions
         return step
 
@@ -277,8 +419,15 @@ class Explorer:
             The earliest stop on the same path; None if nothing is in the way.
 
         Raises:
-            InputError: For a time outside of the motion.
+            InputError: For a time outside of the motion, and for anything but a motion of the robot.
         """
+        check_type("motion", motion, Trajectory, "a Trajectory, such as step.motion.trajectory")
+        if motion.joint_names != self.robot.joint_names:
+            raise InputError(
+                f"motion has the joints {joined(motion.joint_names)}; {self.robot.name}'s are"
+                f" {joined(self.robot.joint_names)}"
+            )
+        time = converted("time", Number, time)
         return stop_before(self.robot, self.scene, self._news, self._free, motion, time)
 
     def _step(self, problem: Problem, policy: str) -> Step:
@@ -301,8 +450,8 @@ class Explorer:
         if self._may_go(motion, policy):
             return self._go(motion, policy)
         look = self._look(problem, policy, predicted, motion)
-        skipped = policy == STRICT and motion.status is Status.NO_PATH
-        # without a view, search for the whole time limit, even if too little was seen free
+        skipped = may_look and policy == STRICT and motion.status is Status.NO_PATH
+        # if no view can be taken, search for the whole time limit, even if too little was seen free
         if look.kind == STUCK and (quick < limit or skipped):
             motion = self._motion(problem, policy, predicted, limit)
             if self._may_go(motion, policy):
@@ -331,9 +480,10 @@ class Explorer:
         predicted: Probabilities | None,
         motion: PlanResult,
     ) -> Step:
-        """The step if the search for a motion under the policy failed: GO if a tentative motion keeps to the
-        policy; else LOOK, at the unseen space that this motion sweeps or from farther back on the way in;
-        else STUCK, with the reason.
+        """The step if the search for a motion under the policy failed.
+
+        GO if a tentative motion keeps to the policy. If not, LOOK: at the unseen space that this motion
+        sweeps, or from farther back on the way in. STUCK, with the reason, if no such view can be taken.
 
         motion: what the search returned: a motion to the goal that does not keep to the policy, or a failed
         result.
@@ -389,11 +539,11 @@ class Explorer:
         allowed = self._seen_free(problem) if policy == STRICT else problem
         tree = ReachableTree(self.robot, allowed.scene, problem.start)
         way_in = self._way_in_to(problem.start)
-        # whether going back along the latest motion would not help: there is none, or it was short
+        # the arm cannot go back far along its latest motion: there is none, or it was short
         hemmed_in = way_in is None or bool(moved(self.robot, way_in[:1], [problem.start])[0] < CONFINED)
         taken = self._goal_seen.taken
         for camera in self.cameras:
-            arguments = wanted, predicted, self._rng, taken, hemmed_in, self._beside
+            arguments = wanted, predicted, self._rng, taken, hemmed_in, self._fixed_view
             paths = best_viewpoints(self.map, tree, camera, *arguments)
             for waypoints in islice(paths, self.settings.look_attempts):
                 if policy == STRICT:
@@ -438,7 +588,7 @@ class Explorer:
         """The problem with obstacles that cover all space not seen free, except near the start and the
         goals."""
         obstacles = not_seen_free(self.map, self.scene, problem.start, goals)
-        return replace(problem, scene=problem.scene.with_shapes([*problem.scene.shapes, *obstacles]))
+        return replace(problem, scene=added(problem.scene, obstacles))
 
     def _along(self, problem: Problem, waypoints: Configurations, name: str) -> PlanResult | None:
         """The motion along waypoints, if the validator accepts it in the problem's scene; else None."""
@@ -462,13 +612,14 @@ class Explorer:
         blocked = surface((self.map.occupied | not_shown) & ~ends)
         name = "occupied, or looked for in vain"
         avoided = cover(self.map, self.scene, MAP.centers(blocked), MAP.edge, name)
-        avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
+        avoiding = replace(as_seen, scene=added(as_seen.scene, [avoided]))
         results = list[tuple[PlanResult, Voxels]]()
         for seed in range(self._seed, self._seed + TENTATIVE_MOTIONS):
             result = self._planned(avoiding, QUICK_FRACTION * self.settings.time_limit, seed)
             if result.path is None and not any(earlier.solved for earlier, _ in results):
                 avoiding = as_seen
                 result = self._planned(as_seen, self.settings.time_limit, seed)
+            # without a path, the voxels are not used
             unseen = ends if result.path is None else self.wanted(result.path)
             results.append((result, unseen))
             if result.path is not None and not unseen.any():
@@ -522,9 +673,9 @@ class Explorer:
     def _with_confidence(
         self, motion: PlanResult, predicted: Probabilities | None, to_goal: bool = True
     ) -> PlanResult:
-        """The motion with the confidence that follows from the summed probability of the voxels that it
-        sweeps; None if the map holds no measurement. Without a path or a prediction, the motion is returned
-        unchanged.
+        """The motion with its confidence, from the summed probability of the voxels that it sweeps. The
+        confidence is None if the map holds no measurement. Without a path or a prediction, the motion is
+        returned unchanged.
 
         The arm counts as free of collision at the start of a motion and at the goal, but not at a viewpoint.
         """
@@ -560,9 +711,10 @@ class Explorer:
         """Predict occupancy by the completion network.
 
         Returns:
-            The probability [nx, ny, nz] that each voxel is occupied, 0 in voxels that the map knows to be
-            free. None if the settings exclude the network, if the network does not cover the arm's reach, and
-            before the first view.
+            The probability [nx, ny, nz] that each voxel is occupied. It is 0 in voxels that the map knows to
+            be free, and 1 near an object that appeared, until a view shows the voxel again. None if the
+            settings exclude the network, if the network does not cover the arm's reach, and before the first
+            view.
         """
         if not (len(self._views) and self.settings.predict):
             return None

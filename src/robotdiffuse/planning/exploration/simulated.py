@@ -11,14 +11,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robotdiffuse.core.errors import InputError, vector
-from robotdiffuse.core.types import Configuration, Configurations, PlanResult, Pose, Trajectory
+from robotdiffuse.core.types import (
+    Configuration,
+    Configurations,
+    PlanResult,
+    Pose,
+    Trajectory,
+)
 from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 from robotdiffuse.perception.ray_caster import MAX_RANGE, looking_at, ray_cast
 from robotdiffuse.perception.seen_points import near_scene
 from robotdiffuse.perception.voxel_grid import Probabilities, Voxels
 from robotdiffuse.planning.exploration.explorer import Explorer
 from robotdiffuse.planning.exploration.steps import LOOK, ArmCamera, ExplorerSettings, Step
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import Problem, is_given
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import verify, verify_trajectory
@@ -120,7 +126,7 @@ class RecordedExplorer(Explorer):
 
 def _waypoints(step: Step, q: Configuration) -> Configurations:
     motion = step.motion
-    return q[None] if motion is None or motion.path is None else motion.path.positions
+    return q[None] if motion is None else motion.path.positions
 
 
 WRIST_OFFSET = (0.04, 0.0, 0.03)
@@ -194,7 +200,7 @@ def simulated_explorer(
 
     Raises InputError for a problem with fields that exploring would ignore.
     """
-    ignored = [name for name in UNSUPPORTED if getattr(problem, name) not in (None, ())]
+    ignored = [name for name in UNSUPPORTED if is_given(getattr(problem, name))]
     if ignored:
         names = ", ".join(ignored)
         raise InputError(f"the problem has {names}, which explore does not support: remove {names}")
@@ -235,14 +241,14 @@ def explore(
     explorer: Explorer,
     noise: DepthNoise | None = None,
     seed: int = 0,
-    beside: DepthView | None = None,
+    fixed_view: DepthView | None = None,
 ) -> Iterator[Event]:
     """Explore the problem's scene from its start to its goal, and yield each step. Ends with a step without a
     motion, or after a motion that the validator refuses in the true scene.
 
     The cameras on the arm take images during each motion.
 
-    beside: an image of a fixed camera. This camera takes another image after each motion, because the arm
+    fixed_view: an image of a fixed camera. This camera takes another image after each motion, because the arm
         then hides another part of the scene.
     """
     rng = np.random.default_rng(seed)
@@ -252,7 +258,7 @@ def explore(
         explorer.observe(taken(problem, camera, q, noise, rng))
     while True:
         step = explorer.next(q)
-        if step.motion is None or step.motion.path is None:
+        if step.motion is None:
             yield Event(step, q)
             return
         path = step.motion.path
@@ -266,9 +272,9 @@ def explore(
             for at in _image_configurations(step.motion):
                 explorer.observe(taken(problem, camera, at, noise, rng))
         q = path.positions[-1]
-        if beside is not None:
-            height, width = beside.depth.shape
-            fixed_camera = beside.T_base_camera, beside.intrinsics, (width, height)
+        if fixed_view is not None:
+            height, width = fixed_view.depth.shape
+            fixed_camera = fixed_view.T_base_camera, fixed_view.intrinsics, (width, height)
             view = ray_cast(problem.scene, *fixed_camera, problem.robot, q)
             explorer.observe(measured(view, np.inf, noise, rng))
         yield Event(step, q, "" if violation is None else violation.message)
@@ -278,7 +284,6 @@ def explore(
 
 def _image_configurations(motion: PlanResult) -> Configurations:
     """The configurations of a motion at which images are taken; the last one is its end."""
-    assert motion.path is not None
     end = motion.path.positions[-1:]
     if motion.trajectory is None:
         return end

@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from jaxtyping import Float
-from numpy import ndarray
-
-from robotdiffuse.core.errors import InputError, positive, rigid_transform
+from robotdiffuse.core.errors import InputError, positive, rigid_transform, shown, vector
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
-from robotdiffuse.core.types import Configurations, PlanResult, Pose, Value
+from robotdiffuse.core.types import Configurations, PlanResult, Pose, Poses, Value
+from robotdiffuse.perception.depth_view import checked_intrinsics
 from robotdiffuse.perception.voxel_grid import Voxels
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -34,9 +32,14 @@ class ArmCamera(Value):
         object.__setattr__(self, "range", positive("camera", "range", self.range))
         pose = rigid_transform("camera.T_link_camera", self.T_link_camera)
         object.__setattr__(self, "T_link_camera", pose)
+        size = vector("camera", "size", self.size, 2)
+        if (size < 1).any() or (size % 1).any():
+            raise InputError(f"camera.size is {shown(self.size)}; it must be two whole numbers of at least 1")
+        object.__setattr__(self, "size", (int(size[0]), int(size[1])))
+        object.__setattr__(self, "intrinsics", checked_intrinsics("camera", self.intrinsics))
         super().__post_init__()
 
-    def poses(self, robot: Robot, q: Configurations) -> Float[ndarray, "n 4 4"]:
+    def poses(self, robot: Robot, q: Configurations) -> Poses:
         """Poses of the camera at configurations of the arm.
 
         Args:
@@ -47,7 +50,7 @@ class ArmCamera(Value):
             T_base_camera of each [n, 4, 4].
 
         Raises:
-            InputError: If the robot lacks the link.
+            InputError: If the robot lacks the link, and for q of the wrong shape.
         """
         return robot.fk(q, self.link) @ self.T_link_camera
 
@@ -74,7 +77,7 @@ class ExplorerSettings(Settings, name="explorer"):
     time_limit: Positive = 1.0
     """Time limit of each search [s]."""
     max_views: Natural = 8
-    """Maximum number of views that the arm moves to take on the way to a goal."""
+    """Maximum number of steps of the kind look on the way to a goal."""
     look_attempts: Count = 4
     """For each camera, a step tries to plan a motion to at most this many viewpoints, the best first."""
     predict: bool = True
@@ -115,6 +118,6 @@ class Step:
     """The known scene and the points of the views that the Explorer still uses; None if nothing was
     planned."""
     wanted: Voxels | None = None
-    """The voxels that the next view should show: voxels that no view saw and that the arm would pass through
-    on a motion to the goal, planned as if unseen space were free, or would fill at the goal. None if the step
-    asks for no view of particular voxels."""
+    """The voxels that the next view should show. No view saw them yet, and the arm would fill them at the
+    goal or pass through them on a motion to the goal that was planned as if unseen space were free. None if
+    the step asks for no view of particular voxels."""

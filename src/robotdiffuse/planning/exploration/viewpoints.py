@@ -1,40 +1,286 @@
-"""Viewpoints: configurations that the arm can reach and from which its camera sees the unseen space that a
-motion would sweep; and the next best view, the pose beside the arm from which a camera sees most of that
-space.
+"""Chooses views of the unseen space that a motion would sweep. Makes obstacles that keep an arm within space
+that was seen free (`not_seen_free`). Tells whether the space that an arm fills at a goal was seen free
+(`GoalSeen`).
+
+Viewpoints are configurations that the arm can reach, for the camera on the arm. The next best view is a pose
+for a camera beside the arm.
+
+For the goal, voxels of 2 cm are too coarse: voxels that the arm touches there are rarely seen free as a
+whole. So small balls cover the arm's surface at the goal. Each ball must be free for one of four reasons:
+
+- an image sees through it: all returns of its pixels are from behind it;
+- it lies in voxels that the map knows to be free;
+- a covering sphere of the arm contained it when an image was taken;
+- it is so near the arm at the start of the motion that it counts as free.
+
+The space inside the surface needs no view, since obstacles do not float.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float32
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.motions import search_space
+from robotdiffuse.collision.kernel_arrays import reach_ball
+from robotdiffuse.collision.motions import search_space, with_covering_spheres
 from robotdiffuse.core.errors import InputError, check_type, rigid_transform
-from robotdiffuse.core.types import Configuration, Configurations, Path, PlanResult, Pose, Value, interpolated
-from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.observed_volume import observe
-from robotdiffuse.perception.occupancy_map import COVER_RADIUS, OccupancyMap
+from robotdiffuse.core.types import (
+    Configuration,
+    Configurations,
+    Path,
+    PlanResult,
+    Points,
+    Pose,
+    Value,
+    Values,
+    Vector,
+    interpolated,
+)
+from robotdiffuse.perception.depth_filter import MARGIN_SPREADS, filtered
+from robotdiffuse.perception.depth_view import AssumedPoints, DepthView
+from robotdiffuse.perception.observed_volume import observe, usable_image
+from robotdiffuse.perception.occupancy_map import (
+    CARVING_MARGIN,
+    COVER_RADIUS,
+    OccupancyMap,
+    ViewMemory,
+    without_known,
+)
 from robotdiffuse.perception.ray_caster import looking_at
-from robotdiffuse.perception.unknown_space import CARVING_MARGIN
-from robotdiffuse.perception.visibility import seen_share
-from robotdiffuse.perception.voxel_grid import FINE, MAP, Probabilities, Voxels, refined
-from robotdiffuse.planning.exploration.seen_free import near_ends
+from robotdiffuse.perception.seen_points import sphere_distances
+from robotdiffuse.perception.visibility import (
+    BALL_RADIUS,
+    see_through,
+    seen_share,
+    surface_balls,
+    within_voxels,
+)
+from robotdiffuse.perception.voxel_grid import FINE, MAP, Probabilities, VoxelGrid, Voxels, refined, surface
 from robotdiffuse.planning.exploration.steps import ArmCamera
 from robotdiffuse.planning.pipeline.unknown_space import policy_for, unknown_space_of
 from robotdiffuse.planning.search.rrt_kernel import branch, extend, make_trees
 from robotdiffuse.problems.problem import PREDICTED, Problem, check_problem
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, check_joints
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Shape
 from robotdiffuse.trajectories.simplification import simplify
+
+PARTS = 4
+"""Near goals, voxels are split into this many parts along each edge."""
+NOT_SEEN_FREE = "not seen free"
+MIN_FREE_SHARE = 0.8
+"""Before a search for a motion to the goal, at least this fraction of the space that the arm fills there but
+not at the start must have been seen free: with less, searches fail (benchmarks/results/exploring.txt)."""
+WALL = 2.0
+"""Thickness of the walls around the map [m]."""
+
+
+def not_seen_free(
+    known: OccupancyMap, known_scene: Scene, start: Configuration, goals: Sequence[Configuration] = ()
+) -> tuple[Shape, ...]:
+    """Obstacles that cover all space that the map does not know to be free, except the known scene.
+
+    Balls cover the voxels at the surface of this space, and walls surround the map. So a motion that the
+    validator accepts among them enters only voxels that are known to be free. There are two exceptions.
+    Voxels with centers near the arm at the start are not covered: the arm could not leave them otherwise.
+    The space within CARVING_MARGIN of the arm at the goals is not covered either: voxels that reach into this
+    space are split, and small balls cover only their parts outside. Seen points are separate obstacles.
+    """
+    unseen = ~(known.free | near_ends(known, (start,)))
+    spheres = np.zeros((0, 4))
+    if goals:
+        spheres = np.concatenate([known.robot.placed_spheres(q) for q in goals])
+    near = MAP.within(spheres, CARVING_MARGIN + COVER_RADIUS)
+    at = surface(unseen)
+    points = MAP.centers(at[~near[tuple(at.T)]])
+    obstacles = [cover(known, known_scene, points, MAP.edge, NOT_SEEN_FREE)]
+    split = np.argwhere(near & unseen)
+    if len(split):
+        low = np.maximum(split.min(axis=0) - 1, 0)
+        block = tuple(map(slice, low, split.max(axis=0) + 2))
+        occupied = refined(unseen[block], PARTS)
+        edge = MAP.edge / PARTS
+        grid = VoxelGrid(tuple(MAP.low + low * MAP.edge), occupied.shape, edge)
+        at = surface(occupied & ~grid.within(spheres, CARVING_MARGIN - COVER_RADIUS / PARTS))
+        points = grid.centers(at[near[block][tuple(at.T // PARTS)]])
+        obstacles.append(cover(known, known_scene, points, edge, NOT_SEEN_FREE))
+    return *obstacles, *_walls()
+
+
+def near_ends(known: OccupancyMap, ends: Sequence[Configuration]) -> Voxels:
+    """The voxels whose centers are at most CARVING_MARGIN plus half an edge from the arm at these
+    configurations."""
+    return MAP.filled(known.robot, ends, CARVING_MARGIN + MAP.edge / 2)
+
+
+def hardly_seen(known: OccupancyMap, start: Configuration, goal: Configuration) -> bool:
+    """Whether so little of the space around a goal was seen free that a search within it would fail."""
+    filled = near_ends(known, (goal,)) & ~near_ends(known, (start,))
+    return bool(known.free[filled].sum() < MIN_FREE_SHARE * filled.sum())
+
+
+def cover(known: OccupancyMap, known_scene: Scene, points: Points, edge: float, name: str) -> AssumedPoints:
+    """Balls that cover voxels, except voxels in the known scene or out of the arm's reach.
+
+    points: centers of the voxels [m]. edge: their edge [m]. name: of the obstacle.
+    """
+    radius = edge * 3**0.5 / 2
+    center, reach = reach_ball(with_covering_spheres(known.robot))
+    points = points[np.linalg.norm(points - center, axis=1) < reach + radius]
+    return AssumedPoints(without_known(points, edge, known.robot, known_scene), radius, name=name)
+
+
+def least_unknown(known: OccupancyMap, goals: Configurations) -> Configuration:
+    """The configuration at which the arm fills the fewest unknown voxels."""
+    return min(goals, key=lambda q: int((known.unknown & MAP.filled(known.robot, [q])).sum()))
+
+
+def reaches_outside(robot: Robot, q: Configuration) -> bool:
+    """Whether the arm reaches out of the map: the centers of some of its covering spheres are outside."""
+    low, high = _corners_of_map()
+    centers = robot.placed_spheres(q)[:, :3]
+    return bool(((centers < low) | (centers > high)).any())
+
+
+def _corners_of_map() -> tuple[Vector, Vector]:
+    """The low and the high corner of the map [m]."""
+    low = np.array(MAP.low)
+    return low, low + np.array(MAP.shape) * MAP.edge
+
+
+def _walls() -> list[Box]:
+    """Boxes around the map."""
+    low, high = _corners_of_map()
+    walls = []
+    for axis in range(3):
+        for at, name in ((low[axis] - WALL / 2, "before"), (high[axis] + WALL / 2, "beyond")):
+            center = (low + high) / 2
+            size = high - low + 2 * WALL
+            center[axis] = at
+            size[axis] = WALL
+            walls.append(Box(tuple(center), tuple(size), name=f"{name} the map, {'xyz'[axis]}"))
+    return walls
+
+
+BORDER = np.float32(1.0)
+"""In filtered images, pixels up to this far outside a ball's outline must also see past the ball [pixels],
+since the filter moves edges by about one pixel."""
+LITTLE_UNSEEN = 1e-3
+"""If less than this part of the surface was not seen, messages say where it is."""
+KEY_DECIMALS = 5
+"""Configurations that are equal to this number of decimals count as the same."""
+
+
+class GoalSeen:
+    """Keeps, for each goal configuration, the balls on the arm's surface that are not yet shown to be
+    free."""
+
+    def __init__(self, robot: Robot, known: OccupancyMap, views: ViewMemory, required: bool) -> None:
+        """views: the kept views, which count for new goals as well. required: whether goals must be seen; if
+        not, nothing is ever missing."""
+        self._robot = robot
+        self._known = known
+        self._views = views
+        self._required = required
+        self._unseen: dict[tuple[float, ...], Points] = {}
+        """Centers of the balls that no view has shown to be free, by configuration [m]."""
+        self.taken: list[Configuration] = []
+        """Configurations of the views since the goal was set."""
+
+    def forget(self) -> None:
+        """Prepare for another goal."""
+        self._unseen.clear()
+        self.taken.clear()
+
+    def observe(self, view: DepthView) -> None:
+        """Take a new view into account."""
+        assert view.configuration is not None  # the map takes no other views
+        self.taken.append(view.configuration)
+        if self._known.max_age is not None:
+            self._unseen.clear()  # computed anew from the kept views, since views are forgotten
+        elif self._required:
+            self._unseen = {q: self._not_shown(balls, [view]) for q, balls in self._unseen.items()}
+
+    def best(self, start: Configuration, goals: Configurations) -> Configuration:
+        """The goal at which the smallest part of the arm's surface is unseen. Other configurations than these
+        goals are forgotten."""
+        best_goal = min(goals, key=lambda q: len(self.unseen(start, q)))
+        goal_keys = set(map(_key, goals))
+        self._unseen = {q: balls for q, balls in self._unseen.items() if q in goal_keys}
+        return best_goal
+
+    def unseen(self, start: Configuration, q: Configuration) -> Points:
+        """The centers of the balls at configuration `q` that nothing has shown to be free [m]. start: the
+        arm's present configuration."""
+        key = _key(q)
+        if key not in self._unseen:
+            self._unseen[key] = self._not_shown(surface_balls(self._robot, q), self._views.views)
+        balls = self._unseen[key]
+        near = self._distances(balls, start) < CARVING_MARGIN - BALL_RADIUS
+        return balls[~(near | within_voxels(balls, BALL_RADIUS, self._known.free, MAP))]
+
+    def wanted(self, path: Path) -> Voxels:
+        """The voxels with unseen parts of the arm's surface at the end of a path."""
+        out = np.zeros(MAP.shape, np.bool_)
+        if self._required:
+            at = MAP.indices(self.unseen(path.positions[0], path.positions[-1]))
+            out[tuple(at[MAP.contains(at)].T)] = True
+        return out
+
+    def missing(self, motion: PlanResult) -> str:
+        """A message on how much of the arm's surface at the end of a motion was not seen and, if it is
+        little, where; "" if nothing is missing."""
+        if not self._required or motion.path is None:
+            return ""
+        start, q = motion.path.positions[[0, -1]]
+        unseen = self.unseen(start, q)
+        if not len(unseen):
+            return ""
+        share = len(unseen) / len(surface_balls(self._robot, q))
+        x, y, z = unseen.mean(axis=0).tolist()
+        where = f", around x {x:.2f}, y {y:.2f}, z {z:.2f} m" if share < LITTLE_UNSEEN else ""
+        return f"{100 * share:.2g} % of the arm's surface at the goal was not seen{where}"
+
+    def _not_shown(self, balls: Points, views: Iterable[DepthView]) -> Points:
+        """The balls that no view shows to be free: no image sees through them, and the arm did not contain
+        them when an image was taken."""
+        for view in views:
+            assert view.configuration is not None  # the map takes no other views
+            depth, _ = usable_image(view, self._robot, view.configuration, 0.0)
+            noise = MARGIN_SPREADS * filtered(view).edge_spread
+            # balls that the arm contained; `see_through` adds those that the image sees through
+            seen = self._distances(balls, view.configuration) < -BALL_RADIUS
+            see_through(
+                depth,
+                np.array(view.intrinsics, np.float32),
+                view.T_base_camera.astype(np.float32),
+                balls,
+                np.float32(BALL_RADIUS),
+                np.array([*view.pose_deviation, noise], np.float32),
+                BORDER if noise else np.float32(0),
+                seen,
+            )
+            balls = balls[~seen]
+        return balls
+
+    def _distances(self, balls: Points, q: Configuration) -> Float32[ndarray, "n"]:
+        """Signed distances of the balls' centers to the arm's covering spheres at a configuration [m]."""
+        return sphere_distances(balls, self._robot.placed_spheres(q).astype(np.float32))
+
+
+def _key(q: Configuration) -> tuple[float, ...]:
+    """A key that is the same for a goal and for the end of a motion to this goal."""
+    return tuple(np.round(q, KEY_DECIMALS).tolist())
+
 
 RESOLUTION = 0.02
 """No point of the arm moves further than this between two checks of a motion [m]."""
 CAPACITY = 2000
 """Maximum number of configurations in a tree."""
-PARTS = (0.25, 0.5, 1.0)
+WAY_PARTS = (0.25, 0.5, 1.0)
 """Fractions of a path's length at which `first_parts` cuts it."""
 
 
@@ -58,7 +304,7 @@ class ReachableTree:
         """The configurations of the tree, the start first."""
         return self._trees.nodes[0, : len(self)].astype(np.float64)
 
-    def grow(self, targets: Configurations, longest: Float[ndarray, "n"]) -> None:
+    def grow(self, targets: Configurations, longest: Values) -> None:
         """Extend the tree from its nearest configuration towards each target, if that motion is free.
 
         longest: the longest extension towards each target [rad, joint-space L2].
@@ -73,7 +319,7 @@ class ReachableTree:
         return waypoints
 
 
-def moved(robot: Robot, to: Configurations, others: Sequence[Configuration]) -> Float[ndarray, "n"]:
+def moved(robot: Robot, to: Configurations, others: Sequence[Configuration]) -> Values:
     """For each configuration of `to`, how far the arm moves to it from the nearest configuration of `others`:
     the mean over the arm's covering spheres [m]."""
     reached, away = (np.stack([robot.placed_spheres(q)[:, :3] for q in rows]) for rows in (to, others))
@@ -83,7 +329,7 @@ def moved(robot: Robot, to: Configurations, others: Sequence[Configuration]) -> 
 def first_parts(waypoints: Configurations) -> Iterator[Configurations]:
     """Beginnings of a path, the shortest first and the whole path last."""
     at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1))])
-    for part in PARTS:
+    for part in WAY_PARTS:
         end = part * at[-1]
         last = interpolated(end, at, waypoints)
         yield np.concatenate([waypoints[at < end], last[None]])
@@ -139,7 +385,7 @@ def best_viewpoints(
     rng: np.random.Generator,
     taken: Sequence[Configuration] = (),
     hemmed_in: bool = False,
-    beside: DepthView | None = None,
+    fixed_view: DepthView | None = None,
 ) -> Iterator[Configurations]:
     """Yields paths to viewpoints from which the camera sees wanted voxels, the best first.
 
@@ -155,8 +401,8 @@ def best_viewpoints(
     hemmed_in: whether the arm cannot go back far enough along its latest motion. If so, the last path leads
     to the configuration in which the arm is farthest from the start and from all of `taken`. If even this
     configuration is nearer than CONFINED, the path to it also comes first.
-    beside: the latest image of a fixed camera. With the arm at a viewpoint, this camera may see wanted voxels
-    that the arm hides now.
+    fixed_view: the latest image of a fixed camera. With the arm at a viewpoint, this camera may see wanted
+    voxels that the arm hides now.
     """
     robot = known.robot
     at = np.ascontiguousarray(np.argwhere(wanted))
@@ -174,19 +420,19 @@ def best_viewpoints(
     space = at, weights, filled, MAP
     start, (width, height) = tree.configurations[0], camera.size
     seen_at_start = 0.0
-    if beside is not None:
-        image = beside.intrinsics, beside.depth.shape, np.inf
-        [seen_at_start] = seen_share(robot, start[None], beside.T_base_camera[None], *image, *space)
+    if fixed_view is not None:
+        image = fixed_view.intrinsics, fixed_view.depth.shape, np.inf
+        [seen_at_start] = seen_share(robot, start[None], fixed_view.T_base_camera[None], *image, *space)
 
-    def scored(q: Configurations) -> Float[ndarray, "n"]:
+    def scored(q: Configurations) -> Values:
         """The scores of configurations; 0 for configurations that see less than MIN_SEEN."""
         on_arm = camera.intrinsics, (height, width), camera.range
         seen = seen_share(robot, q, camera.poses(robot, q), *on_arm, *space)
-        if beside is not None:
-            poses = np.tile(beside.T_base_camera, (len(q), 1, 1))
-            image = beside.intrinsics, beside.depth.shape, np.inf
-            from_beside = seen_share(robot, q, poses, *image, *space)
-            seen = seen + np.maximum(from_beside - seen_at_start, 0.0)
+        if fixed_view is not None:
+            poses = np.tile(fixed_view.T_base_camera, (len(q), 1, 1))
+            image = fixed_view.intrinsics, fixed_view.depth.shape, np.inf
+            seen_now = seen_share(robot, q, poses, *image, *space)
+            seen = seen + np.maximum(seen_now - seen_at_start, 0.0)
         score = seen / (1 + np.linalg.norm(q - start, axis=1) / HALVING_DISTANCE)
         for earlier in taken:
             score *= np.minimum(np.abs(q - earlier).max(axis=1) / SIMILAR_LOOK, 1.0)
@@ -261,10 +507,12 @@ def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None
         poses: Camera poses T_base_camera [4, 4] to choose from; None: 48 poses around the base.
 
     Returns:
-        The pose, and how much of the space a camera there is expected to see.
+        The pose, and how much of the space a camera there is expected to see. If the motion crosses no
+        unknown space, the first pose and 1.
 
     Raises:
-        InputError: The problem has no views, the result has no motion, or `poses` is empty.
+        InputError: `problem` is no Problem or has no views, `result` is no PlanResult, has no motion or is of
+            another robot, or `poses` is empty or holds a pose that is not rigid.
 
     Examples:
         >>> T_base_camera = rd.pose([0.3, -1, 0.5], rpy=[-np.pi / 2, 0, 0])  # it looks along y
@@ -280,6 +528,7 @@ def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None
         raise InputError("next_view: the problem has no views; it is for scenes that cameras saw")
     if result.path is None:
         raise InputError(f"next_view: the result has no motion ({result.status.value})")
+    check_joints("next_view: result.path", result.path.joint_names, problem.robot)
     candidates = (
         poses_around() if poses is None else [rigid_transform("next_view: T_base_camera", T) for T in poses]
     )

@@ -28,6 +28,7 @@ from robotdiffuse.core.types import Path, PlanResult, Status, Trajectory
 from robotdiffuse.planning.context import PlanningContext, PlanRequest, Solver, least_clearances
 from robotdiffuse.planning.pipeline.waypoints import plan_through_waypoints
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.scenes.scene import added
 from robotdiffuse.trajectories.timing import MIN_DISTANCE, SPEED_FACTORS, StopGraph, time_parameterize
 from robotdiffuse.validation.tolerances import goal_error
 from robotdiffuse.validation.validator import verifier
@@ -104,7 +105,7 @@ def _reached(came, clear, row, source, target, first, rows, begin, count):
 def _way_to(end, came, source, first):
     """The indices of the motions that reach the last place at tick `end`, in order; -1 for each tick of
     waiting."""
-    motion_numbers = [0 for _ in range(0)]
+    motion_numbers = [0 for _ in range(0)]  # empty, with a type that Numba can infer
     place = came.shape[1] - 1
     while end > 0:
         m = came[end, place]
@@ -154,7 +155,7 @@ def plan_among_moving_obstacles(planner: Solver, problem: Problem, request: Plan
         if attempts % 2:  # every other path avoids the moving obstacles at their places at a random time
             time = float(rng.uniform(0.0, horizon))
             standing = (obstacle.at(time) for obstacle in problem.moving if obstacle.known)
-            scene = scene.with_shapes([*scene.shapes, *standing])
+            scene = added(scene, standing)
         limit = max(PATH_TIME_FRACTION * (request.time_limit - context.elapsed), 1e-3)
         path_request = replace(request, time_limit=limit, seed=request.seed + attempts // 2)
         at_rest = replace(still, scene=scene)
@@ -169,7 +170,7 @@ def plan_among_moving_obstacles(planner: Solver, problem: Problem, request: Plan
             continue
         attempted_paths += 1
         horizon = max(horizon, result.trajectory.duration)
-        for clearance in (context.clearance, 0.0):
+        for clearance in dict.fromkeys((context.clearance, 0.0)):
             try:
                 with context.deadline():
                     timed = _timed(context, problem, collision, result, clearance)
@@ -233,13 +234,13 @@ def _timed(
         validator.collision_free,
         context.timing,
         context.keeps_constraints,
-        extra=context.beside,
+        extra=context.extra_limits,
         deviations=np.array(static.corner_deviations),
         stops=_stops(problem, path),
     )
     if path.length < MIN_DISTANCE:
         return timing.trajectory
-    graph = StopGraph(robot, timing, context.timing, GRID_STEP, context.beside)
+    graph = StopGraph(robot, timing, context.timing, GRID_STEP, context.extra_limits)
     links = compile_links(robot)[1]
     s, configurations = graph.sample(links.motion_radii.max(axis=0), GRID_TRAVEL)
     # ticks of a motion that stops at every place: the mean over the speed factors

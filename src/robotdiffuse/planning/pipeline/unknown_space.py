@@ -30,7 +30,7 @@ from robotdiffuse.perception.camera_check import camera_note
 from robotdiffuse.perception.depth_filter import measured_share
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.perception.observed_volume import ObservedVolume, merged, observe, observed_by
-from robotdiffuse.perception.unknown_space import (
+from robotdiffuse.perception.occupancy_map import (
     MAX_UNSEEN_SHARE,
     PADDINGS,
     THRESHOLDS,
@@ -47,11 +47,12 @@ from robotdiffuse.planning.context import PlanningContext, PlanRequest, Solver
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import OCCUPIED, OPTIMISTIC, PADDED, PREDICTED, JointGoal, Problem
 from robotdiffuse.scenes.point_cloud import voxel_thin
+from robotdiffuse.scenes.scene import added
 
-# Under an assumption, up to MAX_FIRST_MOTIONS motions are planned, each until the first one is found. The
-# risk of a motion is the sum of the predicted probabilities of all unknown voxels that it sweeps. No more of
-# them are planned once the lowest risk is at most NEGLIGIBLE_RISK, or, after MIN_FIRST_MOTIONS motions, at
-# most ACCEPTABLE_RISK.
+# With predicted probabilities, up to MAX_FIRST_MOTIONS motions are planned under an assumption. Each is the
+# first motion that a search with another seed finds. The risk of a motion is the sum of the predicted
+# probabilities of the unknown voxels that it sweeps. Planning of first motions ends when the lowest risk is
+# at most NEGLIGIBLE_RISK, or, after MIN_FIRST_MOTIONS motions, at most ACCEPTABLE_RISK.
 MAX_FIRST_MOTIONS = 8
 MIN_FIRST_MOTIONS = 4
 ACCEPTABLE_RISK = 2.0
@@ -70,9 +71,9 @@ PICTURE_THRESHOLD = 0.2
 """`predicted_obstacles` has the voxels with a probability above this."""
 FREE_UNKNOWN_SPACE = "unknown space taken as free"
 MIN_MEASURED_SHARE = 0.01
-"""Planning fails if each view has depth at less than this fraction of its pixels."""
+"""Planning fails if each view has a `measured_share` below this."""
 NOTED_SHARE = 0.8
-"""A note names each view that has depth at less than this fraction of its pixels."""
+"""A note names each view with a `measured_share` below this."""
 AS_SEEN = "as seen"
 """Name of the assumption without additional obstacles."""
 
@@ -88,9 +89,9 @@ def plan_with_unknown_space(
 
     predicted: the probability that each fine voxel of the observed volume is occupied; None: the occupancy
     completion network predicts it if the policy needs it. unknown: the space that no view saw; None: computed
-    from the problem's views. A caller that has put the observed points into the scene, as `Explorer` does,
-    may give `unknown`, and then no volume is computed from the views; under the policy predicted it must also
-    give the argument `predicted`.
+    from the problem's views. If the scene already contains the observed points, as in `Explorer`, the caller
+    may give `unknown`. Then no volume is computed from the views. So the policy predicted also needs the
+    argument `predicted`, and the policy occupied is not possible.
 
     The result states the assumption, the confidence (the probability that the motion is free in the true
     scene), and the unknown space that the motion crosses.
@@ -115,8 +116,8 @@ def plan_with_unknown_space(
     shares = [measured_share(view) for view in problem.views]
     if shares and max(shares) < MIN_MEASURED_SHARE:
         why = (
-            "the views measured nothing: hardly a depth is from 5 cm to 10 km; is the camera covered, or are"
-            " the depths, with their scale, not in meters?"
+            "the views measured nothing: almost no depth is between 5 cm and 10 km. Is the camera covered, or"
+            " is the scale of the depths wrong?"
         )
         return _with_notes(context, context.fail(Status.NO_PATH, why))
     for i, wrong in enumerate(cameras):
@@ -185,7 +186,7 @@ def _failed_note(failed: list[str], used: str) -> str:
     """A note on the assumptions under which no motion was found; "" if there are none."""
     if not failed:
         return ""
-    return f"no motion was found in the time given to {', '.join(failed)}: planned with {used}"
+    return f"no motion was found in the time given to {'; '.join(failed)}. Planned with {used}"
 
 
 def _with_notes(context: PlanningContext, result: PlanResult, *notes: str) -> PlanResult:
@@ -240,9 +241,9 @@ def predicted_obstacles(problem: Problem) -> AssumedPoints:
 
 
 def _goals(context: PlanningContext, as_seen: Problem) -> Configurations | PlanResult:
-    """The goal configurations: those of a JointGoal, or those that reach the goal's pose and are free of
+    """The goal configurations: the only one of a JointGoal, or those that reach the goal and are free of
     observed obstacles. A failed result if there are none."""
-    if isinstance(as_seen.goal, JointGoal):
+    if isinstance(as_seen.goal, JointGoal) and len(as_seen.goal.positions) == 1:
         return as_seen.goal.positions
     start_goal = usable_start_goal(PlanningContext(context.planner_name, as_seen, context.request))
     return start_goal if isinstance(start_goal, PlanResult) else np.stack(start_goal.goals)
@@ -252,11 +253,12 @@ def with_assumption(problem: Problem, assumption: Assumption, goals: Configurati
     """The problem with an assumption's obstacles added to the observed scene, except those at the start or at
     the goals. Only the goals at which the fewest obstacles have to be removed are kept."""
     start, *at_goals = (problem.robot.placed_spheres(q).astype(np.float32) for q in (problem.start, *goals))
+    # a single goal is kept, so its obstacles need not be counted
     several = at_goals if len(at_goals) > 1 else ()
     touched = np.array([assumption.touched(spheres).sum() for spheres in several] or [0])
     easiest = np.flatnonzero(touched == touched.min())
     obstacles = assumption.obstacles(np.concatenate([start, *(at_goals[i] for i in easiest)]))
-    scene = problem.scene.with_shapes([*problem.scene.shapes, obstacles])
+    scene = added(problem.scene, [obstacles])
     return replace(problem, scene=scene, goal=JointGoal(goals[easiest]), views=())
 
 
@@ -273,7 +275,7 @@ class _Attempts:
 
     def best(self, problem: Problem, assumption: str, end: float) -> PlanResult:
         """A motion that is found before `end` [s since the call], or the result that says why there is none.
-        Each planning call has at least a minimum time, even after `end`.
+        Each attempt gets at least MIN_TIME_FRACTION of the time limit, so it may end after `end`.
 
         With predicted probabilities, several first motions are planned, and then one that is improved for the
         remaining time. Among those with about the highest confidence, the shortest is returned.

@@ -22,13 +22,14 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, check_type, counted
-from robotdiffuse.core.types import ROWS, Path, PlanResult, Status, Trajectory, for_kernels
+from robotdiffuse.core.errors import InputError, check_type, counted, shown
+from robotdiffuse.core.types import ROWS, Path, PlanResult, Status, Trajectory, Values, for_kernels
 from robotdiffuse.planning.context import (
     MIN_TIME_LIMIT,
+    STOPS_NOTE,
     PlanningContext,
     PlanRequest,
     Solver,
@@ -64,6 +65,7 @@ def plan_through_waypoints(planner: Solver, problem: Problem, request: PlanReque
     goals = (*problem.waypoints, problem.goal)
     has_choice = [not (isinstance(goal, JointGoal) and len(goal.positions) == 1) for goal in goals]
     attempts = 0
+    failure: tuple[int, PlanResult] | None = None
     while True:
         segments: list[PlanResult] = []
         start = problem.start
@@ -80,13 +82,21 @@ def plan_through_waypoints(planner: Solver, problem: Problem, request: PlanReque
             return _joined(context, segments, _motions(context, segments))
         attempts += 1
         failed = segments[-1]
-        # another seed cannot make invalid configurations valid
-        hopeless = failed.status is Status.INVALID_GOAL and isinstance(goals[len(segments) - 1], JointGoal)
+        # an attempt that time cut short does not say why the attempt before it failed
+        if failure is None or failed.status is not Status.TIMEOUT:
+            failure = len(segments), failed
+        # Another seed cannot make an invalid configuration valid, nor a pose reachable. It also changes
+        # nothing if all goals before the failed segment are single configurations, since the segment then
+        # begins at the same one.
+        hopeless = failed.status is Status.UNREACHABLE_GOAL or (
+            failed.status is Status.INVALID_GOAL and isinstance(goals[len(segments) - 1], JointGoal)
+        )
         if hopeless or not any(has_choice[: len(segments) - 1]) or context.remaining <= 0:
-            reason = f"segment {len(segments)} of {len(goals)}: {failed.reason}"
+            number, failed = failure
+            reason = f"segment {number} of {len(goals)}: {failed.reason}"
             # INVALID_START would blame the problem's start, but a later segment begins at a planned
             # configuration
-            later = len(segments) > 1 and failed.status is Status.INVALID_START
+            later = number > 1 and failed.status is Status.INVALID_START
             return context.fail(Status.NO_PATH if later else failed.status, reason)
 
 
@@ -123,13 +133,13 @@ def _without_stops(context: PlanningContext, segments: Sequence[PlanResult], fir
         blend=blend,
         notes=(),
     )
-    remaining = max(context.remaining, MIN_TIME_LIMIT)
-    request = replace(context.request, time_limit=remaining)
+    request = replace(context.request, time_limit=max(context.remaining, MIN_TIME_LIMIT))
     combined = PlanningContext(context.planner_name, part, request, len(segments))
     corners, deviations = _corners(segments)
     for row, goal, radius in zip(corners, part.waypoints, blend, strict=True):
         deviations[row] = _deviation(part, path, int(row), goal, radius)
     clearance = min(combined.clearance, *(segment.min_clearance for segment in segments))
+    # a rounded corner must keep the clearance too: meshes nearer than `contact` count as touching
     padded = verifier(part, replace(DEFAULT, contact=max(clearance, DEFAULT.contact)))
     result = combined.finish(
         path.positions,
@@ -140,7 +150,7 @@ def _without_stops(context: PlanningContext, segments: Sequence[PlanResult], fir
     return None if result is None else result.trajectory
 
 
-def _corners(segments: Sequence[PlanResult]) -> tuple[Int[ndarray, "waypoints"], Float[ndarray, "n"]]:
+def _corners(segments: Sequence[PlanResult]) -> tuple[Int[ndarray, "waypoints"], Values]:
     """For the joined path of segments: the rows at which the waypoints are, and how far from each row the
     motion may pass [rad, joint-space L2], which is 0 at the waypoints."""
     ends = np.cumsum([len(segment.path.positions) - 1 for segment in segments])
@@ -152,13 +162,13 @@ def _corners(segments: Sequence[PlanResult]) -> tuple[Int[ndarray, "waypoints"],
 
 
 def _deviation(problem: Problem, path: Path, row: int, goal: Goal, blend: float) -> float:
-    """How far from the path's corner at a row the motion may pass, so that it still comes within the blend of
-    a goal [rad, joint-space L2]; 0 if no tried deviation is small enough."""
+    """The largest corner deviation, of those tried, with which the motion at this row still passes within the
+    blend of the goal [rad, joint-space L2]. 0 if all of them are too large."""
     corner = for_kernels(path.positions[row - 1 : row + 2])
     deviation = MAX_DEVIATION_PER_BLEND * blend
     for _ in range(MAX_DEVIATIONS):
         line = rounded_line(corner, np.array([deviation]))
-        middle = line(line.knots[1:2], 0)[0]
+        middle = line(line.knots[1:2], 0)[0]  # of the rounded corner
         if goal_error(problem.robot, goal, middle, blend=BLEND_FRACTION * blend) is None:
             return deviation
         deviation *= DEVIATION_FACTOR
@@ -208,7 +218,10 @@ def one_after_another(motions: Sequence[Trajectory]) -> Trajectory:
 
 
 def join(
-    results: Sequence[PlanResult], blend: float = 0.0, time_limit: float = 10.0, **request: Any
+    results: Sequence[PlanResult],
+    blend: float | Sequence[float] = 0.0,
+    time_limit: float = 10.0,
+    **request: Any,
 ) -> PlanResult:
     """Join several motions into one, which is verified as a whole. Each must begin where the one before it
     ends.
@@ -216,20 +229,22 @@ def join(
     Args:
         results: Results of `rd.plan` for the same robot and the same scene, without waypoints.
         blend: The joined motion passes within this distance of each place where two motions meet, without a
-            stop: [m] for a pose, [rad] for a configuration; 0: it stops there. It must be 0 if the motions
-            have different path constraints, or Cartesian lines.
+            stop: [m] for a pose, [rad] for a configuration; 0: it stops there. A list has one number for each
+            place. The motion still stops where no rounding is free, or where stopping is faster. All must be
+            0 if the motions have different path constraints, or Cartesian lines.
         time_limit: Wall time of the call [s].
-        request: Further arguments of `rd.plan`: clearance, velocity_scaling, ... A rounded corner is timed
-            anew with the limits of this call, as are the motions that meet there; so give the scalings with
-            which the motions were planned.
+        request: Further arguments of `rd.plan`: clearance, velocity_scaling, ... Motions that exceed the
+            limits of this call are slowed down, and those that meet at a rounded corner are timed again, with
+            these limits. To keep their speeds, give the scalings with which they were planned.
 
     Returns:
         A result whose problem has the goals of all motions but the last as waypoints; or a result that says
         why the joined motion is not valid.
 
     Raises:
-        InputError: For results without a motion, or with waypoints or a start velocity; for different robots
-            or scenes; and for motions that do not meet.
+        InputError: For fewer than two results; for results without a motion or problem, or with waypoints,
+            views or a start velocity; for different robots, scenes or payloads; for motions that do not meet;
+            and for a blend or further arguments out of bounds, or a blend that the motions do not allow.
 
     Examples:
         >>> space = rd.Workspace(rd.load_robot("panda"))
@@ -264,8 +279,8 @@ def join(
     for i, (before, after) in enumerate(pairwise(results), 1):
         if shared_by_all(after.problem) != shared_by_all(first):
             raise InputError(
-                f"results[{i}] is for another robot, scene or payload than results[0]: execute one after "
-                "the other"
+                f"results[{i}] is for another robot, scene or payload than results[0]; execute these motions "
+                "separately"
             )
         gap = np.abs(after.path.positions[0] - before.path.positions[-1])
         if gap.max() > DEFAULT.start_tolerance:
@@ -275,17 +290,23 @@ def join(
                 f"results[{i}] begins {gap[j]:.3g} {joint.unit} from the end of results[{i - 1}] in "
                 f"{joint.name}: plan it from results[{i - 1}].path.positions[-1]"
             )
-    if blend and any(len(problem.constraints) > len(shared) for problem in problems):
-        raise InputError(
-            f"blend is {blend:g}, but some motions have constraints (or lines) of their own, which a rounded "
-            "corner could violate; join them with blend 0"
-        )
     goals = [problem.goal for problem in problems]
     problem = replace(first, waypoints=goals[:-1], blend=blend, goal=goals[-1], constraints=shared, notes=())
+    if any(problem.blend) and any(len(each.constraints) > len(shared) for each in problems):
+        raise InputError(
+            f"blend is {shown(blend)}, but some motions have constraints (or lines) of their own, which a "
+            "rounded corner could violate; join them with blend 0"
+        )
     context = PlanningContext(results[-1].planner, problem, PlanRequest(time_limit, **request))
+    # without a jerk limit in this call, the motions keep their jerks
     limits = replace(context.timing, jerk=context.request.jerk or np.inf)
+    # notes on stops are left out: their times count from the beginning of one motion
     segments = [
-        replace(result, trajectory=within_limits(result.trajectory, first.robot, limits))
+        replace(
+            result,
+            trajectory=within_limits(result.trajectory, first.robot, limits),
+            notes=tuple(note for note in result.notes if not note.startswith(STOPS_NOTE)),
+        )
         for result in results
     ]
     return replace(_joined(context, segments, _motions(context, segments)), problem=problem)
@@ -308,7 +329,11 @@ def plan_from_start_velocity(planner: Solver, problem: Problem, request: PlanReq
             f"{request.velocity_scaling * robot.velocity[j]:g}"
         )
     direction = velocity / np.linalg.norm(velocity)
-    stop = problem.start + stopping_distance(robot, context.timing, velocity) * direction
+    # how far the arm can move in this direction within its limits
+    margin = np.where(direction > 0, robot.upper - problem.start, problem.start - robot.lower)
+    limited = (direction != 0) & ~np.array(robot.continuous)
+    room = float((margin[limited] / np.abs(direction[limited])).min(initial=np.inf))
+    stop = problem.start + stopping_distance(robot, context.timing, velocity, 0.9 * room) * direction
     beyond = np.flatnonzero(((stop < robot.lower) | (stop > robot.upper)) & ~np.array(robot.continuous))
     if len(beyond):
         reason = f"{robot.joint_names[beyond[0]]} cannot stop from start_velocity within its limits"

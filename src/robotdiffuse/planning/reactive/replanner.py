@@ -1,4 +1,4 @@
-"""Replanning at 50 Hz among obstacles of which only the current position and a maximum speed are known.
+"""Replanning at 50 Hz among obstacles with a known current position and maximum speed, but unknown motion.
 
 **Guarantee.** Every motion that `Replanner.step` returns ends at rest and is certified until then. No point
 of the arm comes near any place that an obstacle can reach, at its maximum speed, from where it was last seen
@@ -7,19 +7,28 @@ itself. If no new motion can be certified, the arm continues its last motion, wh
 may still hit an arm at rest. The replanner evades if it predicts this, but obstacles can corner any arm.
 
 **Limits.** Velocity, acceleration and jerk are within the robot's limits at every time, also while the arm
-stops (`timed_path.JerkFilter`). A joint for which neither the robot nor `ReplannerSettings.jerk` gives a jerk
+stops (`JerkFilter`). A joint for which neither the robot nor `ReplannerSettings.jerk` gives a jerk
 limit has none.
 
 **Prediction.** The replanner chooses its way by a prediction: each obstacle keeps the velocity that was last
 observed. The guarantee does not depend on the prediction.
+
+**The filter for jerk limits** takes a motion within velocity and acceleration limits. It samples the motion
+on a grid of times, averages the samples over a window, and uses the means as control points of a uniform
+cubic B-spline. The spline at any time depends only on samples up to that time, so replanning does not change
+what lies before. Its velocities and accelerations are weighted means of the motion's. Its jerk is at most
+twice the acceleration limit divided by the duration of the window.
 """
 
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Annotated
+from functools import cached_property
+from itertools import pairwise
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.collision import CollisionChecker
@@ -39,18 +48,258 @@ from robotdiffuse.core.errors import (
 from robotdiffuse.core.locked import locked
 from robotdiffuse.core.settings import Bound, NotNegative, Settings
 from robotdiffuse.core.transforms import inverse, rotation_angle, transform
-from robotdiffuse.core.types import Configuration, Configurations, PlanResult, Trajectory, Values, Vector
+from robotdiffuse.core.types import (
+    Configuration,
+    Configurations,
+    Path,
+    PlanResult,
+    Trajectory,
+    Values,
+    Vector,
+)
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
-from robotdiffuse.planning.reactive.timed_path import MIN_LENGTH, JerkFilter, SpeedProfile, TimedPath
 from robotdiffuse.planning.search.rrt import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
 from robotdiffuse.problems.problem import MAX_CLEARANCE, Goal, Problem, check_problem
+from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.moving_obstacles import MovingObstacle
+from robotdiffuse.scenes.scene import MovingObstacle, added
 from robotdiffuse.scenes.shapes import Shape
-from robotdiffuse.trajectories.speed_limits import Jerk
-from robotdiffuse.validation.validator import verifier
+from robotdiffuse.trajectories import braking_kernel
+from robotdiffuse.trajectories.speed_limits import Jerk, TimingSettings, symmetric_bounds, timing_grid
+from robotdiffuse.trajectories.timing import time_parameterize
+from robotdiffuse.trajectories.timing_kernel import (
+    RoundedLine,
+    controllable,
+    line_with_widths,
+    rounded_line,
+    states_at,
+)
+from robotdiffuse.validation.tolerances import DEFAULT
+from robotdiffuse.validation.validator import Verifier, verifier
 
+# Fractions of the velocity and acceleration limits that are used; the remainder is a margin for the motion
+# between grid points.
+VELOCITY_FRACTION = 0.99
+ACCELERATION_FRACTION = 0.96
+CORNER_SAMPLES = 65
+"""Number of configurations of a rounded corner at which distances are checked."""
+MIN_LENGTH = 1e-4
+"""Smallest length of a path [rad, joint-space L2]."""
+LINE_INTERVAL = 0.03
+"""Approximate length of the grid intervals on straight pieces [rad, joint-space L2]."""
+CORNER_INTERVALS = 16
+"""Number of grid intervals in a rounded corner."""
+
+
+class SpeedProfile(NamedTuple):
+    """A motion along a path: values of the path parameter s, and ṡ at each; s̈ is constant between them."""
+
+    s: Values
+    speeds: Values
+
+    def after(self, time: float) -> "SpeedProfile":
+        """What remains of the motion at a time [s] after its beginning."""
+        s, speed = states_at(self.s, self.speeds, np.array([time]))
+        later = self.s > s + 1e-12
+        return SpeedProfile(np.append(s, self.s[later]), np.append(speed, self.speeds[later]))
+
+    @property
+    def duration(self) -> float:
+        """Time until the arm rests [s]."""
+        speed_sums = self.speeds[1:] + self.speeds[:-1]
+        return float((2 * np.diff(self.s)[speed_sums > 0] / speed_sums[speed_sums > 0]).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class TimedPath:
+    """A polyline with rounded corners that passed the validator; the arm need not stop before its end."""
+
+    robot: Robot
+    acceleration: Configuration
+    """Acceleration limits of motions along the path [dof]."""
+    line: RoundedLine
+    to_goal: bool
+    """Whether this path, or the last path that follows it, ends at the goal."""
+    then: "TimedPath | None" = None
+    """The path that follows after a stop at this path's end; None if this is the last path."""
+
+    @staticmethod
+    def certified(
+        validator: Verifier, waypoints: Configurations, to_goal: bool, jerk_filter: "JerkFilter"
+    ) -> "TimedPath | None":
+        """The path through waypoints; None if the validator refuses it, or if its length is below MIN_LENGTH.
+
+        A corner is rounded only if the rounded corner has a clearance of the filter's displacement, since the
+        filter moves the arm off the path by up to this distance. At other corners, the arm stops.
+        """
+        robot = validator.problem.robot
+        path = Path(robot.joint_names, waypoints)
+        if path.length < MIN_LENGTH or not validator.collision_free(path):
+            return None
+
+        contact = max(jerk_filter.displacement, DEFAULT.contact)
+        with_clearance = verifier(validator.problem, replace(DEFAULT, contact=contact))
+
+        def free(motion: Trajectory) -> bool:
+            return validator.collision_free(Path(motion.joint_names, motion.positions))
+
+        def free_around(q: Configurations) -> bool:
+            return with_clearance.collision_free(Path(robot.joint_names, q))
+
+        rows, deviations, _ = time_parameterize(
+            robot, path, free, validator.collision_free, keeps=free_around
+        )
+        line = rounded_line(rows, deviations)
+        for i in np.flatnonzero(deviations):
+            if not free_around(
+                line(line.knots[i + 1] + line.half_widths[i] * np.linspace(-1, 1, CORNER_SAMPLES), 0)
+            ):
+                deviations[i] = 0.0
+        stops = [0, *(np.flatnonzero(deviations == 0) + 1).tolist(), len(rows) - 1]
+        timed = None
+        for first, last in reversed(list(pairwise(stops))):
+            part = line_with_widths(rows[first : last + 1], line.half_widths[first : last - 1])
+            timed = TimedPath(robot, jerk_filter.acceleration, part, to_goal, timed)
+        return timed
+
+    @cached_property
+    def _grid(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+        """The path's first and second derivatives on the grid, the grid of s, and the largest ṡ² on it."""
+        count = max(int(self.line.length / LINE_INTERVAL), 8)
+        grid = timing_grid(self.line, TimingSettings(line_intervals=count, corner_intervals=CORNER_INTERVALS))
+        path = self.line(grid, 1), self.line(grid, 2), grid
+        bounds = symmetric_bounds(self.acceleration, len(grid))
+        return *path, controllable(*path, VELOCITY_FRACTION * self.robot.velocity, *bounds)
+
+    def advance_then_brake(self, s: float, speed: float, time: float = np.inf) -> SpeedProfile:
+        """The motion from s, with the speed ṡ, that is as fast as possible for `time` [s], then brakes to
+        rest, at the latest at the end of the path."""
+        return SpeedProfile(
+            *braking_kernel.advance_then_brake(*self._grid, s, speed, time, self.acceleration)
+        )
+
+    @property
+    def end(self) -> float:
+        """A motion that reaches this s counts as being at the end of the path."""
+        return self.line.length - 1e-9
+
+    def at(self, s: float) -> Configuration:
+        """The configuration at s."""
+        return self.line(np.array([s]), 0)[0]
+
+    def remaining(self, s: float) -> Configurations:
+        """The configuration at s and the waypoints after it, including those of the paths that follow."""
+        waypoints = self.line.waypoints[self.line.knots > s + MIN_LENGTH]
+        after = self.then.remaining(0.0)[1:] if self.then is not None else waypoints[:0]
+        return np.concatenate([self.at(s)[None], waypoints, after])
+
+    def positions(self, motion: SpeedProfile, times: Values) -> Configurations:
+        """Configurations [n, dof] at times [s] after the beginning of a motion; at its end, the arm rests."""
+        return self.line(states_at(*motion, times)[0], 0)
+
+
+MAX_DISPLACEMENT = 0.005
+"""Largest distance by which the filter may move a point of the arm off the path, where the path bends [m]."""
+SHARE_FACTOR = 0.9
+"""Factor by which accelerations are reduced, repeatedly, until MAX_DISPLACEMENT is kept."""
+GRID_TOLERANCE = 1e-4
+"""A time counts as the next grid time if it is earlier by at most this fraction of a step."""
+STILL = 1e-9
+"""The arm rests if its last samples differ by less than this in each joint [rad]."""
+B_SPLINE = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
+"""Coefficients of the uniform cubic B-spline: a row for each power of u, the fraction of a step that has
+passed, and a column for each control point."""
+
+
+class JerkFilter:
+    """The filter for jerk limits: turns a motion within velocity and acceleration limits, which may be
+    replanned on the way, into one within jerk limits; see the docstring of the module."""
+
+    def __init__(self, robot: Robot, jerk: Configuration, step: float, q: Configuration) -> None:
+        """A filter that is at rest at q. step: time between two times of the grid [s]."""
+        reach = float((motion_radii(robot) @ robot.acceleration).max())
+        self.joint_names = robot.joint_names
+        self.step = step
+        share = ACCELERATION_FRACTION
+        # The window of the averages, in samples, follows from the jerk limits. Window and spline smooth the
+        # motion in time. This moves the arm off the path by half the variance of their weights [s²] times
+        # the acceleration. With lower accelerations, a shorter window is enough.
+        while True:
+            window = max(int(np.ceil(2 * share * (robot.acceleration / jerk).max() / step)), 1)
+            variance = step**2 * ((window**2 - 1) / 12 + 1 / 3)
+            displacement = 0.5 * variance * share * reach
+            if displacement <= MAX_DISPLACEMENT:
+                break
+            share *= SHARE_FACTOR
+        self.acceleration = share * robot.acceleration
+        """Acceleration limits that motions to be filtered must keep [dof]."""
+        self.displacement = displacement
+        """Upper bound on how far the filter moves any point of the arm off the path [m]. Where the path is
+        straight in joint space, the filtered motion stays on it."""
+        self._window = window
+        self._samples = np.repeat(q[None], window + 3, axis=0)
+        """Configurations at the last times of the grid, up to the time with index `_index`."""
+        self._origin = -np.inf
+        """Time of the grid with index 0 [s]."""
+        self._index = 0
+        self._ago = 0.0
+        """Time since the last time of the grid [s]."""
+
+    @property
+    def lag(self) -> float:
+        """Largest delay with which the filtered motion comes to rest after the motion that is filtered
+        [s]."""
+        return (self._window + 3) * self.step
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the filtered motion rests, provided that the motion that is filtered continues to rest."""
+        return bool(np.ptp(self._samples, axis=0).max() < STILL)
+
+    def advance(self, path: TimedPath, motion: SpeedProfile, since: float, now: float) -> None:
+        """Sample a motion that began at the time `since` [s], up to the time `now` [s]."""
+        if not np.isfinite(self._origin):
+            self._origin = now
+            return
+        index = int(np.floor((now - self._origin) / self.step + GRID_TOLERANCE))
+        steps = np.arange(max(self._index + 1, index + 1 - len(self._samples)), index + 1)
+        new = path.positions(motion, np.maximum(self._origin + steps * self.step - since, 0.0))
+        self._samples = np.concatenate([self._samples, new])[-len(self._samples) :]
+        self._index = index
+        self._ago = max(now - self._origin - index * self.step, 0.0)
+
+    def follow(self, path: TimedPath, motion: SpeedProfile) -> Trajectory:
+        """The filtered motion from now until it rests, if `motion` begins now; two rows if the arm rests
+        already."""
+        step = self.step
+        window = self._window
+        u = self._ago / step
+        resting = self.at_rest and motion.duration == 0
+        count = 1 if resting else int(np.ceil((motion.duration + self._ago) / step)) + window + 2
+        times = step * np.arange(1, count + 1) - self._ago
+        raw = np.concatenate([self._samples, path.positions(motion, times)])
+        # averages of the differences from the last sample, so that rounding does not move the motion's end
+        total = np.cumsum(np.concatenate([0 * raw[:1], raw - raw[-1]]), axis=0)
+        points = (total[window:] - total[:-window]) / window
+        before = points[1:-3]
+        at = points[2:-2]
+        after = points[3:-1]
+        # The first row is a fraction u of a step after a time of the grid. Rows of `powers`: powers of u, and
+        # their first and second derivatives.
+        powers = np.array([[1, u, u**2, u**3], [0, 1, 2 * u, 3 * u**2], [0, 0, 2, 6 * u]])
+        q, v, a = powers @ B_SPLINE @ points[:4]
+        return Trajectory(
+            self.joint_names,
+            np.append(0.0, times),
+            raw[-1] + np.vstack([q, (before + 4 * at + after) / 6]),
+            np.vstack([v / step, (after - before) / (2 * step)]),
+            np.vstack([a / step**2, (after - 2 * at + before) / step**2]),
+        )
+
+
+FARTHEST = 1000.0
+"""An obstacle is predicted to travel at most this far along each axis, out of reach of any arm [m]."""
 OBSERVATION_ERROR = 1e-3
 """An obstacle may seem to move this much further than its maximum speed allows, for inexact observations
 [m]."""
@@ -64,7 +313,8 @@ class ObservedObstacle:
     """The obstacle, which may move in any way up to its maximum speed, at the pose where it was last seen.
     Until the first observation, this is its pose in the problem."""
     time: float = np.nan
-    """Time of the last observation [s]; NaN: never observed."""
+    """Time of the last observation [s]. An obstacle that the first step does not observe counts as observed
+    then, at its pose in the problem; NaN: before the first step."""
     velocity: Vector | None = None
     """Velocity of its origin, from the last two observations [m/s]. Until there are two, it is the velocity
     in the problem; None: unknown."""
@@ -101,13 +351,13 @@ class ObservedObstacle:
     def straight_on(self, now: float) -> MovingObstacle:
         """The obstacle as one that keeps its last observed velocity, from the time `now` [s] on."""
         velocity = np.zeros(3) if self.velocity is None else self.velocity
-        travel = transform((now - self.time) * velocity)
-        return MovingObstacle(self.obstacle.shape.moved(travel), velocity=velocity)
+        travel = np.clip((now - self.time) * velocity, -FARTHEST, FARTHEST)
+        return MovingObstacle(self.obstacle.shape.moved(transform(travel)), velocity=velocity)
 
 
 class PredictedObstacles:
     """Moving obstacles from the time `since` [s] on, for checks of timed motions. They are predicted
-    (`straight_on`), or grown: each fills all space that it can have reached."""
+    (`straight_on`), or grown, so that each fills all space that it can have reached."""
 
     def __init__(self, robot: Robot, moving: list[MovingObstacle], since: float) -> None:
         self._moving = moving
@@ -135,7 +385,8 @@ class PredictedObstacles:
     def comes(
         self, q: Configuration | Configurations, times: float | Values, rest_time: float
     ) -> float | None:
-        """Time at which an obstacle first touches the arm [s]; None if none does. The arm moves through the
+        """Time from which the covering spheres do not prove the arm free of the obstacles [s]; None if they
+        always do. The arm moves through the
         configurations q at `times` [s] and then rests for `rest_time` [s]. With a single configuration and
         time, it only rests, from this time on."""
         times = np.append(times, np.max(times) + rest_time) - self._since
@@ -183,8 +434,8 @@ class ReplannerSettings(Settings, name="replanner"):
     clearance: NotNegative = 0.005
     """Distance of the covering spheres to every place that the obstacles can reach [m]."""
     sample_time: Annotated[float, Bound(least=1e-3, most=0.1)] = 0.005
-    """Time between the rows of the motion that a step returns [s]. The filter for jerk limits delays motions
-    by at least four of these times."""
+    """Time between the rows of the motion that a step returns [s]. The filter makes the arm come to rest
+    later, by up to `JerkFilter.lag`, which is at least four times this, also without jerk limits."""
     jerk: Jerk | None = None
     """Jerk limit of every joint [rad/s³] or [m/s³]; None: each joint's own limit, and no limit for a joint
     without one. The default of `rd.plan` for such joints, 10 s⁻¹ times the acceleration limit, would make
@@ -224,7 +475,8 @@ class Replanner:
             seed: Seed of all random numbers, at least 0.
 
         Raises:
-            InputError: For a problem without moving obstacles, with waypoints, constraints or a payload, or
+            InputError: For arguments of the wrong type, a negative seed, and a problem without moving
+                obstacles, with waypoints, constraints or a payload, with an unusable start or goal, or
                 without a path in the static scene.
         """
         check_problem(problem)
@@ -301,15 +553,17 @@ class Replanner:
         Args:
             observation: For each observed obstacle, by name, T_base_obstacle [4, 4] or only the origin of its
                 frame [3]. An obstacle that is missing may be anywhere that it can have reached since it was
-                last seen.
+                last seen; if it never was, since the first step, when it counts as seen where the problem
+                says.
             now: Time of the observation [s]; it must grow from step to step.
 
         Returns:
             The motion to execute, which ends at rest, and the time at which it begins.
 
         Raises:
-            InputError: For unknown names, invalid poses, time that does not grow, and obstacles that were
-                faster than their maximum speed, which voids the guarantee.
+            InputError: For an observation that is no mapping, unknown names, invalid poses, time that is not
+                finite or does not grow, and obstacles that were faster than their maximum speed, which voids
+                the guarantee.
         """
         clock = numbers(now)
         if clock is None or clock.ndim != 0 or not np.isfinite(clock):
@@ -334,8 +588,7 @@ class Replanner:
         self._change_path()
         renewed = self._next is None and self._extend(predicted, grown, clear)
         motion = self._filter.follow(self._path, self._motion)
-        arrived = self._rests and self._at_goal()
-        return Command(begins, motion, renewed, arrived)
+        return Command(begins, motion, renewed, self._rests and self._at_goal())
 
     @property
     def _rests(self) -> bool:
@@ -350,7 +603,8 @@ class Replanner:
         path = self._path
         s = self._motion.s[0]
         if self._must_leave:
-            return bool(np.linalg.norm(self._goals - path.at(s), axis=1).min() < MIN_LENGTH)
+            off = self._goals - path.at(s)
+            return bool(np.linalg.norm(off - self._robot.whole_turns(off), axis=1).min() < MIN_LENGTH)
         return bool(path.to_goal and path.then is None and s >= path.end)
 
     def _first_path(self) -> tuple[TimedPath, Configurations, Space]:
@@ -382,8 +636,8 @@ class Replanner:
                 self._seen[name] = replace(observed, time=now)
 
     def _predict(self) -> PredictedObstacles:
-        """The predicted obstacles, inflated by the largest fraction of the safety margin that the arm keeps
-        at its current place."""
+        """The predicted obstacles, inflated by the largest of MARGIN_FRACTIONS with which none is predicted
+        to touch the arm where it is now; not inflated if each of them is too large."""
         moving = [observed.straight_on(self._now) for observed in self._seen.values()]
         speeds = np.array([observed.obstacle.top_speed for observed in self._seen.values()])
         position = self._path.at(self._motion.s[0])
@@ -395,9 +649,10 @@ class Replanner:
         return predicted
 
     def _choose_path(self, predicted: PredictedObstacles) -> bool:
-        """Search for another path if the chosen one is predicted to be blocked, or if the arm rests and the
-        path does not lead to the goal. Returns whether the path that was chosen before is predicted to be
-        free."""
+        """Search for another path if the goal has changed, if the chosen path is predicted to be blocked, or
+        if the arm rests and the path does not lead to the goal. If none is found and an obstacle is predicted
+        to hit the resting arm, choose an evasion. Returns whether the path that was chosen before is
+        predicted to be free."""
         rest_time = self._rest_time
         rest = self._path.at(self._motion.s[-1])
         next_path = self._path if self._next is None else self._next
@@ -415,8 +670,8 @@ class Replanner:
 
     def _path_clear(self, predicted: PredictedObstacles, path: TimedPath, under_way: bool) -> bool:
         """Whether the arm is predicted to meet no obstacle on a path: within HORIZON, or until it has rested
-        at the end for REST_TIME if the motion is shorter. under_way: it is on the path already; False: it
-        begins the path when it rests."""
+        at the end for REST_TIME if the motion is shorter. under_way: whether the arm is on this path now;
+        if not, it begins the path once it rests."""
         s, speed = (self._motion.s[0], self._motion.speeds[0]) if under_way else (0.0, 0.0)
         begins = self._since if under_way else self._rest_time
         motion = path.advance_then_brake(s, speed)
@@ -431,10 +686,9 @@ class Replanner:
         path was found."""
         self._searches += 1
         later = time + PREDICTION_DELAYS[self._searches % len(PREDICTION_DELAYS)]
-        still = self._still.scene
-        scene = still.with_shapes([*still.shapes, *predicted.shapes(later)])
-        checker = CollisionChecker(self._robot, scene)
-        # the last part of the current path that is free: the waypoints after its last blocked segment
+        checker = CollisionChecker(self._robot, added(self._still.scene, predicted.shapes(later)))
+        # the last part of the current path that is free: the waypoints after its last blocked segment;
+        # without one, all but the first, which is `start`
         old = self._goals[:0]
         if self._path.to_goal and not self._must_leave:
             old = self._path.remaining(self._motion.s[-1])
@@ -452,8 +706,11 @@ class Replanner:
         if not search.first(work=ITERATIONS) or search.best is None:
             return None
         path = start_goal.complete(search.best)
-        end = int(np.abs(roots - path[-1]).max(axis=1).argmin())
-        after = old[end - len(self._goals) + 1 :] if end >= len(self._goals) else old[:0]
+        # the root that the search reached: a goal, or a waypoint of the old path, whose rest then follows
+        off = path[-1] - roots
+        turns = self._robot.whole_turns(off)
+        end = int(np.abs(off - turns).max(axis=1).argmin())
+        after = old[end - len(self._goals) + 1 :] + turns[end] if end >= len(self._goals) else old[:0]
         waypoints = np.concatenate([path, after])
         return TimedPath.certified(self._validator, waypoints, True, self._filter)
 
@@ -464,8 +721,9 @@ class Replanner:
         directions = self._rng.normal(size=(EVASIONS, robot.dof))
         directions *= EVASION_RADIUS / np.linalg.norm(directions, axis=1, keepdims=True)
         ends = np.clip(rest + directions, robot.lower, robot.upper)
-        best = np.stack([rest, rest])
-        best_time = predicted.comes(rest, time, HORIZON) or np.inf
+        best = np.stack([rest, rest])  # stay: without length, it is not certified
+        comes = predicted.comes(rest, time, HORIZON)
+        best_time = np.inf if comes is None else comes
         for end in ends:
             line = np.stack([rest, end])
             lasts = float((np.abs(end - rest) / robot.velocity).max()) + EVASION_OVERHEAD
@@ -506,8 +764,7 @@ class Replanner:
             motion = self._filter.follow(path, extended)
             end_time = self._since + motion.duration
             left_alone = clear or predicted.comes(motion.positions[-1], end_time, REST_TIME) is None
-            certified = grown.clear_of(motion, self._since, settings.clearance)
-            if certified and (left_alone or not path.to_goal):
+            if grown.clear_of(motion, self._since, settings.clearance) and (left_alone or not path.to_goal):
                 self._motion = extended
                 return True
         return False

@@ -1,4 +1,4 @@
-"""Search under path constraints: RRT-Connect with projected nodes, and simplification, in the anytime loop.
+"""Search under path constraints for `rrt.anytime`: RRT-Connect with projected nodes, and simplification.
 
 The trees with projected steps are those of CBiRRT2: D. Berenson, S. Srinivasa and J. Kuffner, "Task Space
 Regions: A framework for pose-constrained manipulation planning", IJRR 2011. Edges are proved, not sampled. A
@@ -23,7 +23,8 @@ from robotdiffuse.problems.constraint_kernel import evaluate, make_work, proved
 from robotdiffuse.problems.projection_kernel import project
 
 MAX_DEPTH = 9
-"""Largest number of ends of pieces that `between` has yet to reach; it grows by one with each halving."""
+"""Largest size of the stack of `between`: the ends of pieces that it has yet to reach. Each halving adds
+one."""
 MIN_PIECE = 0.004
 """Pieces shorter than this are not halved [rad]."""
 MAX_PIECES = 512
@@ -35,9 +36,9 @@ MIN_PROOF_PIECE = 1 / 16
 """Shortest part of a piece in a proof, as a fraction of the piece's length."""
 MAX_DRIFT = 0.85
 """Largest distance of a projected middle from either end, as a fraction of the piece's length."""
-MIN_APPROACH = 0.95
-"""Largest distance to the target after an extension, as a fraction of the distance before. If the target is
-more than ten steps away, it suffices to come nearer by half a step."""
+MAX_REMAINING = 0.95
+"""An extension must end closer to its target than this fraction of the distance from which it began. For
+targets more than ten steps away, half a step closer is enough."""
 MAX_STEP_FACTOR = 2.0
 """Largest ratio of the length of an edge to the length of the straight line that it replaces."""
 SHORTCUT_GAIN = 0.99
@@ -59,7 +60,7 @@ class Limits(NamedTuple):
     """[rows] greatest values of the constraint rows, slightly smaller than the validator's limits."""
     work: tuple
     growing: np.ndarray
-    """[rows] greatest values along the piece that is being proved."""
+    """[rows] limits of the constraint rows for the piece that is being proved, see MAX_GROWTH."""
     stack: np.ndarray
     """[MAX_DEPTH, dof] ends of the pieces that `between` has yet to reach."""
     out: np.ndarray
@@ -82,6 +83,7 @@ def make_limits(rows, row_limits):
     )
 
 
+# the compiled functions in place of `rrt_kernel.keep` and `rrt_kernel.extended`
 @overload(rrt_kernel.keep)
 def _keep(limits, q):
     return lambda limits, q: project(limits.rows, limits.row_limits, q, limits.work)
@@ -101,7 +103,7 @@ def _extended(space, limits, trees, tree, near, q, longest, scratch):
             if not project(limits.rows, limits.row_limits, end, limits.work):
                 return -1
             # the projection may have undone most of the step
-            if distance(end, q) > max(MIN_APPROACH * gap, gap - 0.5 * longest):
+            if distance(end, q) > max(MAX_REMAINING * gap, gap - 0.5 * longest):
                 return -1
         if trees.sizes[tree] + MAX_PIECES > trees.nodes.shape[1]:
             return -1
@@ -187,7 +189,7 @@ def line(space, limits, a, b):
 
 @kernel(nogil=True)
 def simplify(space, limits, path, rounds, tries, state):
-    """A path that is not longer than `path` and has its start and goal. First `tries` shortcuts between
+    """A simpler path with the start and goal of `path`. First `tries` shortcuts between
     random waypoints are tried, and waypoints that a straight piece can skip are removed. Then each of
     `rounds` rounds smooths the corners. At the end, waypoints that can be skipped are removed again."""
     scratch = make_scratch(space, path)
@@ -232,8 +234,8 @@ def _finer(path):
 
 @inner_kernel()
 def _skipped(space, limits, path, scratch):
-    """The path without waypoints that straight pieces can skip. From each waypoint, pieces to waypoints ever
-    further ahead are tried until one fails."""
+    """The path without waypoints that straight pieces can skip. From each waypoint, a piece to the second
+    next waypoint is tried, then to waypoints further and further ahead, until one fails."""
     out = np.empty(path.shape)
     n = 0
     i = 0

@@ -93,10 +93,10 @@ FINAL_CANDIDATES = 2
 valid motion is returned."""
 END_MARGIN = 1e-6
 """Under path constraints, the search widens its tolerances to the values of the constraints at the start and
-the goals, plus this margin."""
+the goals, plus this margin, but not beyond the problem's tolerances."""
 PATHS_TO_FIND = 2
-"""With until="converged", RRT-Connect and searches under path constraints end after this many paths; the best
-path is returned."""
+"""With until="converged", RRT-Connect and searches under path constraints look for this many paths, and go on
+until `optimize_time` is over; the best path is returned."""
 
 SHORTCUTS = 60
 """Number of shortcuts that are tried on each path under path constraints."""
@@ -110,12 +110,12 @@ class SearchSettings(Settings):
     """Longest extension of a tree [rad, joint-space L2]; longer extensions collide more often."""
     resolution: Positive = 0.05
     """Largest travel of any point of the arm between two collision checks of a motion [m]. The search halves
-    it each time that the validator, which certifies the whole motion, refuses a path."""
+    it, down to 2 mm, each time that the validator, which certifies the whole motion, refuses a path."""
     smoothings: Natural = 1
     """Number of rounds of smoothing for each path found."""
     tightenings: Natural = 200
     """Number of attempts to shorten a path by small moves of its waypoints. The first path is shortened only
-    once there is time to improve it."""
+    once there is time to improve it. Ignored under path constraints."""
     iterations: Count = 20_000
     """Largest number of iterations in a round, and of nodes in each tree. If the first round finds no path,
     later rounds have five times as many."""
@@ -497,7 +497,8 @@ def usual_clearances(wanted: float) -> list[float]:
     """The clearances that a search tries in turn, falling [m].
 
     These are FALLING_FRACTIONS of the wanted clearance. If it is above the default clearance, its fractions
-    above the default come first, then FALLING_FRACTIONS of the default. MIN_CLEARANCE and 0 come last.
+    above the default come first, then FALLING_FRACTIONS of the default. Clearances up to MIN_CLEARANCE are
+    left out; MIN_CLEARANCE and 0 come last.
     """
     falling = [fraction * wanted for fraction in FALLING_FRACTIONS]
     if wanted > DEFAULT_CLEARANCE:
@@ -529,15 +530,18 @@ class _Validation:
         search = self.search
         motions = search.motions
         interval = 0 if self.context.problem.constraints else VALIDATION_INTERVAL
-        if self.best is None or search.work < self._validated_at + interval:
-            return self.best is None
+        if self.best is None:
+            return True
+        if search.work < self._validated_at + interval:
+            return False
         if motions is None or motions.best is None:
             return search.best is not self._path
         return motions.best.time < (1 - MIN_TIME_GAIN) * _duration(self.best)
 
     def run(self) -> bool:
-        """Validate the best path of the search, or, after the first valid result, the fastest candidate. If a
-        path is refused, the search goes back to its last valid path.
+        """Validate the fastest candidate if there is a valid result already, or if no time is left to search.
+        If motions are not optimized, or there is no valid result after that, validate the best path of the
+        search. If this path is refused, the search goes back to its last valid path.
 
         Returns False if it went back, or if nothing valid was found in time.
         """
@@ -595,7 +599,9 @@ class _Validation:
         # If covering spheres collide at the start or goal, the search begins or ends nearby, where they do
         # not: at a lead, see `StartGoal`. The direct way, without the lead, is tried first, since the meshes
         # may be free there.
-        direct, by_leads = (self.search.start_goal.complete(path, direct) for direct in (True, False))
+        complete = self.search.start_goal.complete
+        direct = complete(path, direct=True)
+        by_leads = complete(path)
         result = self._finished(direct, stage)
         if result is None and len(direct) < len(by_leads):
             result = self._finished(by_leads, stage)
@@ -634,14 +640,19 @@ class _Validation:
         return result
 
     def _keep(self, result: PlanResult | None) -> None:
-        """Make a result the best one; if the objective is time, only if its motion is faster."""
-        by_time = self.context.request.objective == TIME
-        if result is not None and (not by_time or _duration(result) < _duration(self.best)):
+        """Make a result the best one if its motion is faster or, for the objective length, its path is
+        shorter."""
+        cost = _duration if self.context.request.objective == TIME else _length
+        if result is not None and cost(result) < cost(self.best):
             self.best = result
 
 
 def _duration(result: PlanResult | None) -> float:
     return np.inf if result is None or result.duration is None else result.duration
+
+
+def _length(result: PlanResult | None) -> float:
+    return np.inf if result is None or result.path_length is None else result.path_length
 
 
 def anytime(
@@ -664,8 +675,7 @@ def anytime(
     request = context.request
     problem = context.problem
     if request.objective == TIME and request.until != FIRST and not problem.constraints:
-        goals = goals_of(problem.goal)
-        joint_goals_only = all(isinstance(goal, JointGoal) for goal in goals)
+        joint_goals_only = all(isinstance(goal, JointGoal) for goal in goals_of(problem.goal))
         longest = np.inf if joint_goals_only else MAX_DETOUR * float(search.straight.min())
         search.motions = TimeOptimization(
             problem.robot, context.timing, search.start, search.goals, request.seed, longest
@@ -724,11 +734,13 @@ class AORRTCSettings(SearchSettings, name="aorrtc"):
 @dataclass(frozen=True)
 class RRTConnectSettings(SearchSettings, name="rrt_connect"):
     optimize_time: NotNegative = 0.0
-    """With until="converged": time for restarts after the first path [s]."""
+    """With until="converged": least time for restarts after the first path [s]. Restarts also go on until
+    PATHS_TO_FIND paths are found."""
 
 
 class AORRTC(Planner[AORRTCSettings]):
-    """Asymptotically optimal RRT-Connect (T. Wilson et al., 2025), anytime."""
+    """Asymptotically optimal RRT-Connect (T. Wilson et al., 2025), anytime. Under path constraints, it is
+    RRT-Connect with restarts, and the settings `gain`, `patience` and `tightenings` are ignored."""
 
     name = "aorrtc"
     settings_class = AORRTCSettings

@@ -8,7 +8,8 @@ Almost-surely asymptotically optimal planning with RRT-Connect", RA-L 2025; samp
 Srinivasa and T. D. Barfoot, "Informed RRT*", IROS 2014.
 
 Without path constraints, `limits` is None and edges are straight lines. With path constraints, `limits` is a
-`constrained.Limits`, and the module `constrained` defines `keep` and `extended`.
+`constrained.Limits`. `keep` and `extended` are empty here; the module `constrained` overloads them for
+compiled code.
 """
 
 from typing import NamedTuple
@@ -30,8 +31,8 @@ _NOWHERE = np.float32(1e15)
 # A squared distance that is larger than those of nodes and smaller than those of unused places [rad²]
 _FAR = np.float32(1e29)
 LINE_SHARE = np.float32(0.5)
-"""While there is no path: fraction of the samples that are drawn around the straight line from start to goal;
-the other samples are uniform."""
+"""Without a bound and without path constraints: fraction of the samples that are drawn around the straight
+line from start to goal; the other samples are uniform."""
 LINE_SPREAD = np.float32(0.3)
 """Standard deviation of the samples around the straight line, as a fraction of a joint's range."""
 

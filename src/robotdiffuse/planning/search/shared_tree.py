@@ -62,8 +62,8 @@ NEIGHBORS = 64
 REMAINING_EXCESS = np.float32(0.5)
 """Expected final excess of a goal's cost over the straight line, as a fraction of the current excess."""
 MIN_PROMISE = np.float32(0.03)
-"""Is added to the promise of each goal in `draw_goal` when a path is known, so that every goal that may still
-have the shortest path is drawn at times."""
+"""Once a path is known, `draw_goal` adds this to the promise of each goal. So every goal that may still have
+the shortest path is drawn at times."""
 TIGHTENINGS = 200
 """Number of attempts to shorten a path."""
 
@@ -104,9 +104,9 @@ def _best_cost(trees, goals):
 
 
 @allocation_free()
-def _is_open(trees, goals, g, best):
+def _is_open(goals, g, best):
     """Whether a path to the goal might still be shorter than the best one to any goal."""
-    return goals.bound[g] < min(best, _goal_cost(trees, goals, g)) * (_ONE - GAIN)
+    return goals.bound[g] < best * (_ONE - GAIN)
 
 
 @allocation_free(inner=False)
@@ -122,10 +122,11 @@ def draw_goal(trees, goals, state):
     total = _ZERO
     chosen = -1
     for g in range(len(goals.at)):
-        if not _is_open(trees, goals, g, best):
+        if not _is_open(goals, g, best):
             continue
         bound = goals.bound[g]
         if best < INFINITE:
+            # a goal without a path, or with a long one, counts as reached at 1.5 times the best cost
             cost = min(_goal_cost(trees, goals, g), np.float32(1.5) * best)
             hope = best - bound - REMAINING_EXCESS * (cost - bound)
             promise = max(hope / best, _ZERO) + MIN_PROMISE
@@ -143,7 +144,7 @@ def draw_goal(trees, goals, state):
 def _draw(space, trees, goals, g, state, out):
     """Write a sample for goal g to `out`: the goal itself with the probability GOAL_BIAS until it is reached;
     otherwise from its hyperspheroid, or from the joint range while there is no path."""
-    best = min(_goal_cost(trees, goals, g), _best_cost(trees, goals))
+    best = _best_cost(trees, goals)
     if goals.node[g] < 0 and random(state) < GOAL_BIAS:
         for j in range(len(out)):
             out[j] = goals.at[g, j]
@@ -154,11 +155,11 @@ def _draw(space, trees, goals, g, state, out):
 
 
 @allocation_free()
-def _remaining(trees, goals, q, best):
+def _remaining(goals, q, best):
     """A lower bound of the cost from q to any goal whose path may still become shorter."""
     h_hat = INFINITE
     for g in range(len(goals.at)):
-        if _is_open(trees, goals, g, best):
+        if _is_open(goals, g, best):
             h_hat = min(h_hat, distance(q, goals.at[g]))
     return h_hat
 
@@ -179,7 +180,7 @@ def add_node(space, trees, goals, q, scratch, index, gaps):
     nodes = trees.nodes[0]
     costs = trees.costs[0]
     best = _best_cost(trees, goals)
-    remaining = _remaining(trees, goals, q, best)
+    remaining = _remaining(goals, q, best)
     for i in range(count):
         gaps[i] = np.sqrt(gaps[i])
     # x_min, the parent of least cost. Parents are tried in the order of cost, since usually the edge from the

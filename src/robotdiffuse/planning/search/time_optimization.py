@@ -36,8 +36,8 @@ MOVE_LOG_RANGE = 5.0
 REPEAT_FACTOR = 2.0
 """After a successful move, the waypoint is moved again by this multiple of the move."""
 MIN_DEVIATION = 0.002
-"""`free_deviations` neither checks nor halves deviations up to this [rad]; later timing may round corners
-less."""
+"""`free_deviations` accepts a deviation up to this without a check [rad]. Timing checks the corner later, and
+rounds it less if it is not free."""
 MIN_SEGMENT = 0.005
 """Shortest segment [rad]."""
 # A rounded corner is checked along chords of this length [rad], of which there are at most MAX_CHORDS.
@@ -57,7 +57,7 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, longest, 
     """
     scratch = make_scratch(space, space.lower)
     step = np.zeros(path.shape[1])
-    moved = np.int64(0)  # a literal 0 would be compiled separately
+    moved = np.int64(0)  # a literal 0 has another type, for which Numba would compile again
     for _ in range(tries):
         new, new_deviations, first, last = _candidate(space, path, deviations, step, moved, state)
         moved = 0
@@ -68,7 +68,7 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, longest, 
             continue
         new_time = estimated_time(line, velocity, acceleration)
         if new_time < time and _is_free(space, line, first, last, scratch):
-            if len(new) == len(path):
+            if len(new) == len(path):  # waypoint `last` moved: the last changed segment begins there
                 step[:] = new[last] - path[last]
                 moved = last if np.abs(step).max() > 0 else 0
             path = new
@@ -79,9 +79,9 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, longest, 
 
 @inner_kernel(inline="always")
 def _candidate(space, path, deviations, step, again, state):
-    """A changed path, its deviations, and the indices of the first and the last changed segment. The path has
-    no waypoints if one of these is too short and no waypoint was removed. again: index of a waypoint that
-    moves again in the direction `step`; 0: a random change."""
+    """A changed path, its deviations, and the indices of the first and the last changed segment. If a segment
+    beside an added or moved waypoint is too short, the path is empty. again: index of a waypoint that moves
+    again in the direction `step`; 0: a random change."""
     n, dof = path.shape
     kind = np.float32(1.0) if again else random(state)
     i = again if again else 1 + min(int(random(state) * (n - 2)), n - 3)
@@ -91,7 +91,7 @@ def _candidate(space, path, deviations, step, again, state):
         return new, new_deviations, i - 1, i - 1
     if kind < ADD_SHARE:  # add waypoint i in the middle of a segment
         i = 1 + min(int(random(state) * (n - 1)), n - 2)
-        corner = min(i - 1, n - 3)
+        corner = min(i - 1, n - 3)  # it gets the deviation of the next corner, or of the last one
         new = np.concatenate((path[:i], 0.5 * (path[i - 1 : i] + path[i : i + 1]), path[i:]))
         new_deviations = np.concatenate(
             (deviations[: i - 1], deviations[corner : corner + 1], deviations[i - 1 :])
@@ -168,7 +168,7 @@ MAX_CANDIDATES = 6
 FIRST_ATTEMPTS = 32
 ATTEMPTS = 16
 BEST_TURNS = 3
-"""Number of times that the fastest candidate is improved for each time that another candidate is."""
+"""The fastest candidate is improved this many times in a row, then another candidate once."""
 OPTIMALITY_TOLERANCE = 2e-3
 """A motion counts as optimal if its time exceeds the time that its slowest joint would need alone by at most
 this fraction."""
@@ -281,12 +281,13 @@ class TimeOptimization:
         self._sort()
 
     def improve(self, space: Space) -> None:
-        """Make ATTEMPTS attempts on one candidate: the best one, or every fourth time another in turn."""
+        """Make ATTEMPTS attempts to make one candidate faster: three times the fastest one, then once
+        another; the others take turns."""
         self._turn += 1
         runners_up = len(self.candidates) - 1
         cycle, turn = divmod(self._turn, BEST_TURNS + 1)
-        chosen = self.candidates[1 + cycle % runners_up if runners_up and turn == 0 else 0]
-        self._improve(space, chosen, ATTEMPTS)
+        chosen = 1 + cycle % runners_up if runners_up and turn == 0 else 0
+        self._improve(space, self.candidates[chosen], ATTEMPTS)
         self._sort()
 
     def improves(self, gain: float, patience: int) -> bool:
