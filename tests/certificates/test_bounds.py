@@ -150,8 +150,7 @@ def test_no_point_goes_further_against_a_normal_than_its_approach(seed: int) -> 
         points = mesh.vertices @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
         moved_by = np.flatnonzero(linkage.moved[k] & ~linkage.moved[base])
         bound = linkage.approach(places.origins[0], places.axes[0], points[0], moved_by, steps, normals, np.zeros(PANDA.dof))
-        went = (points[0] - points) @ normals.T
-        assert (bound + 1e-12 >= went.max(axis=0).T).all()
+        assert (bound + 1e-12 >= ((points[0] - points) @ normals.T).max(axis=0).T).all()
 
 
 def test_unknown_shapes_are_refused_by_name() -> None:

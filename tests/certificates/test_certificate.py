@@ -85,7 +85,7 @@ TOO_QUICK = {
     "one short step": (SHORT_STEP, "mean velocity between rows"),
     "1e-8 s": (micro_steps(1e-8), "mean velocity from one row to another"),
     "5e-7 s": (micro_steps(5e-7), "mean velocity from one row to another"),
-    "1e-6 s": (micro_steps(1e-6), "mean acceleration by its positions"),
+    "1e-6 s": (micro_steps(1e-6), "mean acceleration computed from positions"),
 }
 
 

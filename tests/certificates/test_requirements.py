@@ -122,6 +122,8 @@ def test_paths_with_constraints_are_certified_and_with_moving_obstacles_refused(
     certificate = rd.load_certificate(tmp_path / "certificate.json")
     assert certificate.check().differences == certificate.check(problem).differences == ()
     refused(certificate, replace(problem, constraints=[narrower]), "is not shown to keep its limit")
+    forged = replace(certificate, jerks=tuple((name, 1.0) for name in PANDA.joint_names))
+    refused(forged, problem, "jerks: the motion is a path")
     with pytest.raises(rd.InputError, match="certificates prove nothing about moving obstacles"):
         rd.certify(replace(problem, constraints=(), moving=[ACROSS]), path)
 

@@ -4,7 +4,7 @@ import errno
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from unittest.mock import DEFAULT, MagicMock, Mock
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ from helpers.example_robots import example_robot, planar_arm
 from helpers.refusals import refuses
 from helpers.sphere_oracles import distance, solids
 from robotdiffuse.collision.exact_meshes import ExactCollision, explain_collision, forward_frames
+from robotdiffuse.robots import robot_folder
 from robotdiffuse.robots.fitting.convex_parts import convex_hull
 from robotdiffuse.robots.fitting.covering_spheres import cover
 from robotdiffuse.robots.robot_folder import SURFACE_FILE, read_robot_folder, write_robot_folder
@@ -272,15 +273,14 @@ def test_folders_keep_the_surfaces_and_refuse_those_of_other_meshes(tmp_path: Pa
 
 
 def test_a_folder_without_its_surfaces_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Regression: robot.json was written first, so that after a full disk or a kill the arm was read without surfaces."""
-    save = np.savez_compressed
-
-    def until_full(file: Any, **arrays: Any) -> None:
-        if "grazing" in arrays:
-            raise OSError(errno.ENOSPC, "full")
-        save(file, **arrays)
-
-    monkeypatch.setattr(np, "savez_compressed", until_full)
+    """Regressions: robot.json was written first, so that after a full disk or a kill the arm was read without surfaces; later,
+    a full disk removed an earlier robot."""
+    full = OSError(errno.ENOSPC, "full")
+    write_robot_folder(channel(False), tmp_path, {})
+    monkeypatch.setattr(robot_folder, "TemporaryFile", MagicMock(side_effect=[full, DEFAULT]))
+    monkeypatch.setattr(robot_folder, "write_atomically", Mock(side_effect=[None, full]))
+    refuses("cannot be written: full", write_robot_folder, channel(), tmp_path, {})
+    assert not read_robot_folder(tmp_path).grazing
     refuses("cannot be written: full", write_robot_folder, channel(), tmp_path, {})
     refuses("robot.json", read_robot_folder, tmp_path)
 

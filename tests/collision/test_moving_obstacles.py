@@ -74,6 +74,13 @@ def test_certificate_is_coals_verdict() -> None:
     assert 0 < sum(found) < 30
 
 
+def test_meshes_decide_for_a_single_row_too() -> None:
+    """Regression: where only the covering spheres touched an obstacle, a motion of one row counted as in contact."""
+    beside = rd.Sphere(PANDA.fk(START, "panda_link6")[:3, 3] + [0.0, 0.0, 0.125], 0.05)
+    moving = MovingCollision(PANDA, [rd.MovingObstacle(beside, velocity=[0, 0, 0])], 1e-4, 0.5)
+    assert moving.sweep(np.zeros(1), START[None]).contact is None
+
+
 def test_what_is_unknown_is_anywhere_that_it_can_be() -> None:
     """The arm rests beside a ball that may approach at 0.1 m/s: it is free until the ball can have reached it."""
     ball = rd.Sphere([0.3, 0.0, 1.4], 0.1)

@@ -6,7 +6,7 @@ import pytest
 import robotdiffuse as rd
 from helpers.heavy_arms import ROBOTS, TURNED, pendulum, wild
 from robotdiffuse.robots.dynamics import Dynamics
-from robotdiffuse.validation.torques import Excess, Pieces, first_excess, static_pieces, trajectory_pieces
+from robotdiffuse.validation.validator import Excess, Pieces, first_excess, static_pieces, trajectory_pieces
 
 pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
 LOOKS = 41
@@ -55,19 +55,13 @@ def test_a_peak_between_two_times_is_found() -> None:
     assert beyond(9.75, trajectory_pieces(motion)) is None
 
 
-def test_torques_are_those_of_the_cubics() -> None:
+def test_torques_are_those_of_the_cubics_also_of_long_motions_and_of_one_row() -> None:
     """At rest, the cubic has 12 rad/s² at both ends, whatever accelerations are written; gravity alone needs 2.4 N m."""
     still = np.zeros((2, 1))
     motion = rd.Trajectory(("hinge",), np.array([0.0, 0.5]), np.array([[-0.25], [0.25]]), still, still)
     assert beyond(5.3, trajectory_pieces(motion)) and not beyond(6.0, trajectory_pieces(motion))
-
-
-def test_a_motion_that_winds_on_and_on_is_refused_in_bounded_time() -> None:
     winds = rd.Trajectory(("hinge",), np.array([0.0, 1e5]), np.zeros((2, 1)), np.full((2, 1), 2.0), np.zeros((2, 1)))
     assert beyond(9.9, trajectory_pieces(winds))
-
-
-def test_a_motion_of_one_row_is_held() -> None:
     row = np.array([[1.5]])
     still = np.zeros((1, 1))
     for pieces in (static_pieces(row), trajectory_pieces(rd.Trajectory(("hinge",), np.zeros(1), row, still, still))):

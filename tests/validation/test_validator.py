@@ -46,8 +46,7 @@ def refused(report: Report, kind: str) -> Violation:
 def dense(rows: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Configurations at most `step` apart in any joint along a path, and their indices with fractions."""
     counts = np.maximum(np.ceil(np.abs(np.diff(rows, axis=0)).max(axis=1) / step).astype(int), 1)
-    at = [i + np.arange(n) / n for i, n in enumerate(counts)]
-    where = np.concatenate([*at, [len(rows) - 1.0]])
+    where = np.concatenate([*(i + np.arange(n) / n for i, n in enumerate(counts)), [len(rows) - 1.0]])
     return np.stack([np.interp(where, np.arange(len(rows)), column) for column in rows.T], axis=1), where
 
 
@@ -315,6 +314,12 @@ def test_motions_begin_and_end_at_rest(end: int) -> None:
     steady = SWING[0] + times[:, None] * rates
     rates[[0, -1]] = 0
     refused(verified(rd.Trajectory(good.joint_names, times, steady, rates, 0 * rates)), "acceleration")
+    # Regressions: a motion of one row passed at rest; the message on a velocity in the wrong direction had no sign
+    problem = rd.Problem(box_arm(), rd.Scene(), SWING[0], rd.JointGoal(SWING[1:]), start_velocity=[0.3, 0, 0])
+    still = rd.Trajectory(good.joint_names, np.zeros(1), SWING[:1], 0 * SWING[:1], 0 * SWING[:1])
+    assert "start_velocity 0.3" in refused(rd.verify(replace(problem, goal=problem.start), still), "rest").message
+    back = replace(good, velocities=good.velocities - np.eye(101, 3) * [0.3, 0, 0])
+    assert "velocity is -0.3" in {v.kind: v.message for v in rd.verify(problem, back).found}["rest"]
 
 
 @given(st.integers(0, 2**31), st.sampled_from([1e-4, 0.01, 0.05, 0.3]))

@@ -34,8 +34,7 @@ from robotdiffuse.core.types import (
     Vector,
 )
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.moving_obstacles import MovingObstacle
-from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene import MovingObstacle, Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
 CLEARANCE_CAP = 1.0
@@ -63,7 +62,7 @@ class Rounded(NamedTuple):
     rounding: float
     """Radius of the ball [m]."""
 
-    def reach(self, n: Float[ndarray, "k 3"]) -> Values:
+    def reach(self, n: Points) -> Values:
         """The support function: the maximum of n · x over the body's points x, for each unit vector n."""
         local = n @ self.R
         across = np.hypot(local[:, 0], local[:, 1])
@@ -110,7 +109,7 @@ class Surface:
                     point_rows = np.repeat(near_points[some], counts[some])
                     triangles = self.corners[rows[np.concatenate(within[some]).astype(int)]]
                     np.minimum.at(nearest, point_rows, _to_triangles(points[point_rows], triangles))
-        return np.minimum(nearest - self.radius, CLEARANCE_CAP)
+        return nearest - self.radius
 
     def near(self, center: Vector, reach: float) -> "Surface":
         """The elements that come within `reach` [m] of a point, and possibly others."""
@@ -178,8 +177,7 @@ def _body(shape: Shape) -> Rounded | Surface:
         case Cylinder() | Capsule():
             half = np.array([0.0, 0.0, shape.height / 2])
             R = rotation_from_quaternion(shape.wxyz)
-            round_ends = isinstance(shape, Capsule)
-            disc, rounding = (0.0, shape.radius) if round_ends else (shape.radius, 0.0)
+            disc, rounding = (0.0, shape.radius) if isinstance(shape, Capsule) else (shape.radius, 0.0)
             return Rounded(shape.center, R, half, disc, rounding)
         case PointCloud():
             return Surface(shape.points[:, None], shape.point_radius)
@@ -188,7 +186,10 @@ def _body(shape: Shape) -> Rounded | Surface:
             vertices = mesh.vertices @ rotation_from_quaternion(mesh.wxyz).T + mesh.xyz
             return Surface(vertices[mesh.faces], 0.0)
         case _:
-            raise InputError(f"{shape.name}: a {type(shape).__name__} cannot be certified")
+            raise InputError(
+                f"{shape.name}: a {type(shape).__name__} cannot be certified; it must be a sphere, box, "
+                "cylinder, capsule, point cloud, mesh or height map"
+            )
 
 
 def _to_triangles(p: Points, triangles: Float[ndarray, "n 3 3"]) -> Values:
@@ -220,8 +221,8 @@ class Claim(NamedTuple):
 
     link: str
     against: str
-    """SCENE, the name of a moving obstacle, or the name of the other link. Of two links, `link` is
-    the one that at least as many joints move as the other."""
+    """SCENE, the name of a moving obstacle, or the name of the other link. Of two links, `link` is the one
+    that is moved by at least as many joints."""
 
 
 class Stretches(NamedTuple):
@@ -266,7 +267,7 @@ class Part(NamedTuple):
     radius: float
     """Radius of this ball [m]."""
 
-    def reach(self, n: Float[ndarray, "k 3"]) -> Values:
+    def reach(self, n: Points) -> Values:
         """The support function: the maximum of n · x over the part's points x, for each unit vector n."""
         return (self.vertices @ n.T).max(axis=0) + self.rounding
 
@@ -337,8 +338,7 @@ class Prover:
         pairs = []
         for i, a in enumerate(self.links):
             for b in self.links[i + 1 :]:
-                relative_motion = (moved[a] != moved[b]).any()
-                if relative_motion and frozenset((a, b)) not in self.robot.allowed_collisions:
+                if (moved[a] != moved[b]).any() and frozenset((a, b)) not in self.robot.allowed_collisions:
                     pairs.append(Claim(a, b) if level[a] > level[b] else Claim(b, a))
         return (*moving, *pairs)
 
@@ -424,8 +424,7 @@ class Prover:
         row, ball, begin = self._expand(links)
         at = posture[row]
         radius = self._balls[ball, 3]
-        T = postures.T[at, links[row]]
-        centers = _placed_points(T, self._balls[ball, :3])
+        centers = _placed_points(postures.T[at, links[row]], self._balls[ball, :3])
         went = self.linkage.displacement(postures, at, centers, radius, moved[row], spans)
         clearance = np.full(len(links), CLEARANCE_CAP)
         if distances is not None:

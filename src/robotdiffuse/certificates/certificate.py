@@ -14,8 +14,7 @@ from robotdiffuse.certificates.bounds import Claim, Plane, Stretches
 from robotdiffuse.certificates.checker import Findings, check
 from robotdiffuse.certificates.proof import DECIMALS, MotionProof, StretchProof, Tolerances, joined
 from robotdiffuse.core.errors import MAX_RATE, InputError, numbers, one_line, reading, shown, within
-from robotdiffuse.core.input_files import known_ending, read_json
-from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.core.files import JsonObject, check_output, known_ending, read_json, write_atomically
 from robotdiffuse.core.settings import Number, converted
 from robotdiffuse.core.types import Path, Trajectory, check_motion_arrays
 from robotdiffuse.problems.problem import Problem
@@ -107,17 +106,17 @@ def is_certificate(record: object) -> bool:
     return isinstance(record, dict) and record.get("is") == FILE_MARK
 
 
-def _motion_record(motion: Path | Trajectory) -> dict[str, Any]:
+def _motion_record(motion: Path | Trajectory) -> JsonObject:
     arrays = ("positions", *(RATE_ROWS if isinstance(motion, Trajectory) else ()))
     rows = {name: getattr(motion, name).tolist() for name in arrays}
     return {"joint_names": list(motion.joint_names), **rows}
 
 
-def _proof_record(proof: StretchProof | None) -> list[dict[str, Any]] | None:
+def _proof_record(proof: StretchProof | None) -> list[JsonObject] | None:
     return proof and [_claim_record(proof, k, claim) for k, claim in enumerate(proof.claims)]
 
 
-def _claim_record(proof: StretchProof, k: int, claim: Claim) -> dict[str, Any]:
+def _claim_record(proof: StretchProof, k: int, claim: Claim) -> JsonObject:
     rows = np.flatnonzero(proof.stretches.claim == k)
     first, end = (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, 0)
     return {
@@ -136,25 +135,26 @@ def _claim_record(proof: StretchProof, k: int, claim: Claim) -> dict[str, Any]:
     }
 
 
-def _motion(_: str, record: dict[str, Any]) -> Path | Trajectory:
+def _motion(_: str, record: JsonObject) -> Path | Trajectory:
     arrays = {name: record[name] for name in ("positions", *RATE_ROWS) if name in record}
     names, checked = check_motion_arrays(record["joint_names"], arrays, "motion.")
     return Path(names, **checked) if len(checked) == 1 else Trajectory(names, **checked)
 
 
-def _proof(_: str, record: list[dict[str, Any]] | None) -> StretchProof | None:
+def _proof(_: str, record: list[JsonObject] | None) -> StretchProof | None:
     if record is None:
         return None
     parts = [_claim_proof(k, entry) for k, entry in enumerate(record)]
     return joined(tuple(claim for part in parts for claim in part.claims), parts)
 
 
-def _claim_proof(k: int, entry: dict[str, Any]) -> StretchProof:
+def _claim_proof(k: int, entry: JsonObject) -> StretchProof:
     claim = Claim(str(entry["link"]), str(entry["against"]))
     start, stop, clearance, displacement = (_vector(name, entry[name]) for name in STRETCH_FIELDS)
     count = len(start)
     if not len(stop) == len(clearance) == len(displacement) == count:
-        raise InputError(f"proof of {claim.link}: start, stop, clearance and displacement need equal lengths")
+        lengths = ", ".join(f"{name} has {len(entry[name])} numbers" for name in STRETCH_FIELDS)
+        raise InputError(f"proof of {claim.link}: {lengths}; these lists must have equal lengths")
     by_planes = np.zeros(count, bool)
     by_planes[[int(i) for i in entry["by_planes"]]] = True
     planes = []
@@ -176,7 +176,7 @@ def _named_bounds(_: str, rows: list[Any]) -> tuple[tuple[str, float], ...]:
 def _vector(name: str, value: object) -> ndarray:
     array = np.zeros(0) if value == [] else numbers(value)
     if array is None or array.ndim != 1 or not within(array, MAX_RATE):
-        raise InputError(f"{name} must be a list of numbers within ±{MAX_RATE:g}")
+        raise InputError(f"{name} is {shown(value)}; it must be a list of numbers within ±{MAX_RATE:g}")
     return array
 
 

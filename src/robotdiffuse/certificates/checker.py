@@ -67,9 +67,9 @@ def check(
 
     Robot, scene and motion must have the content that was certified. The motion must keep the limits along
     the cubics that join its rows, begin at the start, stop at each waypoint or pass it within its blend, and
-    end at the goal. Every stretch must be proved free. `requirements.not_checked` lists what only the
-    validator checks. Raises InputError if there is no problem, and for shapes that certificates do not
-    support.
+    end at the goal. Every stretch must be proved free. `requirements.not_checked` lists what is not checked.
+    Raises InputError if there is no problem, or a damaged one in the certificate, and for shapes, names of
+    links and goals of Cartesian lines that certificates do not support.
     """
     if problem is None:
         if certificate.problem is None:
@@ -200,7 +200,8 @@ def _bound_errors(
 
 
 def _gaps(proof: StretchProof, last: float) -> Iterator[str]:
-    """A message for each claim with stretches that do not cover the motion from row 0 to row `last`."""
+    """A message for each claim with stretches that are not in order, or do not cover the motion from row 0 to
+    row `last` without gap or overlap."""
     stretches = proof.stretches
     for k, claim in enumerate(proof.claims):
         rows = np.flatnonzero(stretches.claim == k)
@@ -208,8 +209,7 @@ def _gaps(proof: StretchProof, last: float) -> Iterator[str]:
         stop = stretches.stop[rows]
         edges = np.concatenate([[0.0], stop]), np.concatenate([start, [last]])
         # A motion of one row needs a stretch too; without one, both edges are row 0, so there is no gap.
-        empty = not len(rows)
-        broken = np.flatnonzero((edges[0] != edges[1]) | np.append(stop < start, empty))
+        broken = np.flatnonzero((edges[0] != edges[1]) | np.append(stop < start, not len(rows)))
         if len(broken):
             low, high = (float(side[broken[0]]) for side in edges)
             yield f"proof: {describe_claim(claim)} is missing from row {low:g} to row {high:g}"

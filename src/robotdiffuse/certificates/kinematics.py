@@ -240,7 +240,8 @@ class Cubics(NamedTuple):
     @property
     def turning_points(self) -> Configurations:
         """Positions that include the extremes of each joint inside each cubic: two rows per cubic, at the
-        roots of the velocity, or elsewhere on the cubic where there is no root inside."""
+        roots of the velocity; for a root that is missing or outside, at any other place on the cubic."""
+        # the two roots of v + start * share + curve * share**2 / 2, in a form without cancellation
         v = self.velocities / self.steps
         curve = self.end - self.start
         root = np.sqrt(np.maximum(self.start**2 - 2 * curve * v, 0.0))
@@ -256,9 +257,11 @@ class Cubics(NamedTuple):
         return np.concatenate(points)
 
     def deviations(self, times: Values) -> JointRows:
-        """Upper bounds on how far each joint leaves the straight lines between its positions at these times,
-        which include the times of all rows: an eighth of its greatest acceleration between two times,
-        multiplied by the square of the time between them."""
+        """Upper bounds on how far each joint leaves the straight lines between its positions at these times.
+
+        The bound is an eighth of the greatest acceleration between two times, multiplied by the square of
+        the time between them. The times include those of all rows.
+        """
         row = self.rows(times[:-1])
         ends = (self.at(row, end - self.times[row])[2] for end in (times[:-1], times[1:]))
         return np.abs([*ends]).max(axis=0) * np.diff(times)[:, None] ** 2 / 8

@@ -8,13 +8,11 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
-from numpy import ndarray
 
 from robotdiffuse.certificates.bounds import Claim, Plane, Stretches
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Number, Settings
-from robotdiffuse.core.types import Path, Trajectory, Values
+from robotdiffuse.core.types import Mask, Path, Trajectory, Values
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot, hashed_content
 from robotdiffuse.scenes.scene import Scene
@@ -59,7 +57,7 @@ class StretchProof:
 
     claims: tuple[Claim, ...]
     stretches: Stretches
-    by_planes: Bool[ndarray, "n"]
+    by_planes: Mask
     """Whether planes between convex meshes prove the stretch; otherwise the covering spheres do."""
     clearance: Values
     """Clearance of the link in the middle of each stretch [m], rounded down."""
@@ -116,7 +114,7 @@ class MotionProof:
     """Lower bound on the distance between links that are checked against each other, along the whole motion
     [m]."""
     proof: StretchProof
-    """That the arm is free of the scene and of itself."""
+    """The proof that the arm collides neither with the scene nor with itself."""
     problem: dict[str, Any] | None = None
     """The problem as in a problem file; None if the robot cannot be loaded by a name or file."""
     request_parts: dict[str, str] = field(default_factory=dict)

@@ -1,5 +1,5 @@
-"""The checker's own tests of every requirement except freedom from collision: limits, start, goal, rates,
-path constraints and torques.
+"""Tests by which the checker of certificates proves every requirement except freedom from collision: limits,
+start, goal, rates, path constraints and torques. They are independent of the validator.
 
 Path constraints: from one configuration to the next, each joint j moves by dq_j at a constant rate. The
 origin p of a frame then deviates from the chord (the straight line between its two positions) by at most an
@@ -7,8 +7,8 @@ eighth of its largest second derivative. This derivative is at most sum_jk |dq_j
 where L_m is an upper bound on the distance of p from the axis of joint m during the motion. The distance of a
 point to a convex body is a convex function. So along the chord, this distance is at most the larger of its
 values at the two ends; the deviation is added. An axis of the frame deviates from its own chord by at most
-(sum_j |dq_j|)² / 8. The angle between two rotating frames changes at most at the sum of their speeds of
-rotation.
+(sum_j |dq_j|)² / 8. On a Cartesian line, the angle between the frame and its interpolated orientation
+changes at most at the sum of their speeds of rotation.
 
 Torques are computed at samples: the rows of the motion and places between them. Between two samples,
 positions follow a cubic or a straight line, and velocities and accelerations are its derivatives.
@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.certificates.kinematics import (
@@ -40,6 +40,7 @@ from robotdiffuse.core.types import (
     Configurations,
     JointRows,
     JointValues,
+    Mask,
     Path,
     Points,
     Pose,
@@ -69,9 +70,9 @@ class _FrameMotion(NamedTuple):
     """Motion of a frame from each of n + 1 configurations to the next."""
 
     p: Points
-    """Position of its origin at each configuration [m]."""
+    """Position of the frame's origin at each configuration [m]."""
     R: ndarray
-    """Its rotation at each configuration."""
+    """Rotation of the frame at each configuration."""
     turn: Values
     """Upper bound of the angle by which the frame rotates, for each of the n steps [rad]."""
     travel: Values
@@ -90,8 +91,8 @@ def constraint_bounds(
     """The quantities that path constraints limit, such as a distance or an angle: the name of each, upper
     bounds from each configuration to the next, and its largest allowed value [m] or [rad].
 
-    The bounds hold for every motion that stays within `chord` [rad] or [m] of the straight lines in each
-    joint. Raises InputError for a Cartesian line if the goal is not a single pose.
+    The bounds hold for every motion in which each joint leaves its straight line by at most `chord` [rad] or
+    [m]. Raises InputError for a Cartesian line if the goal is not a single pose.
     """
     linkage = Linkage(problem.robot)
     q = q if len(q) > 1 else np.repeat(q, 2, axis=0)
@@ -200,8 +201,7 @@ def _allowed_box(constraint: Constraint, *ends: Pose) -> tuple[Vector, Rotation,
         T = constraint.T_base_box
         assert T is not None  # ensured by the constructor
         middle = (constraint.low + constraint.high) / 2
-        half = (constraint.high - constraint.low) / 2
-        return T[:3, :3] @ middle + T[:3, 3], T[:3, :3], half
+        return T[:3, :3] @ middle + T[:3, 3], T[:3, :3], (constraint.high - constraint.low) / 2
     if isinstance(constraint, CartesianLine):
         start, goal = (T[:3, 3] for T in ends)
         length = float(np.linalg.norm(goal - start))
@@ -247,7 +247,7 @@ def _angle_bounds(along: _FrameMotion, chord: float, *ends: Pose) -> Values:
     total_angle = float(_angles(turn[None], np.eye(3))[0])
     axis = np.linalg.eigh(turn + turn.T)[1][:, -1]
     axis = axis if _skew(turn) @ axis >= 0 else -axis  # an eigenvector's sign is arbitrary
-    if length < MIN_LINE_LENGTH:  # rotation in place: compare with the nearest of its orientations
+    if length < MIN_LINE_LENGTH:  # rotation in place: the nearest orientation between start and goal
         turned = along.R @ T_start[:3, :3].T
         cosines = np.trace(turned, axis1=1, axis2=2) - turned @ axis @ axis
         angles = np.clip(np.arctan2(_skew(turned) @ axis, cosines), 0.0, total_angle)
@@ -287,8 +287,8 @@ intervals."""
 def _product(factor: ndarray, other: ndarray) -> ndarray:
     """The `Bound` of a product, by the product rule."""
     size, first, second = other
-    twice = factor[2] * size + 2 * factor[1] * first + factor[0] * second
-    return np.stack([factor[0] * size, factor[1] * size + factor[0] * first, twice])
+    second_derivative = factor[2] * size + 2 * factor[1] * first + factor[0] * second
+    return np.stack([factor[0] * size, factor[1] * size + factor[0] * first, second_derivative])
 
 
 def torque_bounds(problem: Problem, motion: Path | Trajectory, samples: Values) -> JointRows:
@@ -307,7 +307,8 @@ def _intervals(motion: Path | Trajectory, samples: Values) -> tuple[ndarray, Val
 
     Returns positions, velocities and accelerations at the start and the end of each interval [2, 3, m, dof];
     durations [s], 1 for a path; and the `Bound` of the positions, velocities and accelerations
-    [3, 3, m, dof]. Derivatives are by time; for a path, which is at rest, by the fraction of the interval.
+    [3, 3, m, dof]. Derivatives are by time. A path has no times: its velocities and accelerations are 0, and
+    derivatives are by the fraction of the interval.
     """
     cubics = cubics_of(motion)
     if isinstance(motion, Path) or not len(cubics.times):
@@ -358,14 +359,15 @@ def _newton_euler(
     of_body: Callable[[Inertia, str, Any], tuple[ndarray, Callable[[ndarray], ndarray]]],
     cross: Callable[[ndarray, ndarray], ndarray],
 ) -> list[tuple[ndarray, ndarray]]:
-    """The axis of each planned joint, and the force or moment along it: vectors, or the `Bound` of each.
+    """The axis of each planned joint, and the force or moment on it: vectors, or the `Bound` of each.
 
     at_base: the motion of the base: its rotation as `of_joint` and `of_body` need it, its angular velocity,
         which is 0, its angular acceleration, and the acceleration of its origin, opposite to gravity.
     of_joint: takes a joint, its index (None if it is not planned) and the rotation of the parent link.
-        Returns the arm from the parent's origin to the child's; the axis, and the joint's velocity and
-        acceleration along it, None for a joint that is not planned; and the rotation of the child link.
-    of_body: takes a body, its link and the link's rotation. Returns the arm to the center of mass, and a
+        Returns five values: the vector from the parent's origin to the child's, the axis, the joint's
+        velocity and acceleration along it, and the child link's rotation. For a joint that is not planned,
+        axis, velocity and acceleration are None.
+    of_body: takes a body, its link and the link's rotation. Returns the vector to the center of mass, and a
         function that multiplies a vector by the inertia.
     cross: the cross product.
     """
@@ -456,16 +458,17 @@ def _link_inertias(problem: Problem) -> dict[str, list[Inertia]]:
 
 
 AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
-"""Windows over which mean accelerations are tested [s]. The longer windows are used only if any rows are
-closer than the first window, because the tolerance of positions hides accelerations between such rows."""
+"""Windows over which mean accelerations are tested [s]. Between rows closer than the first window, the
+tolerance of positions may hide a large acceleration. If there are such rows, the longer windows are tested
+too."""
 AGREEMENT = 0.5
-"""Largest distance of a row's acceleration from the interval between the accelerations of the cubics before
-and after the row, as a fraction of the joint's largest acceleration."""
+"""How far a row's acceleration may be outside the range between those of the cubics before and after it, as a
+fraction of the joint's peak acceleration in the motion."""
 REST_SHARE = 0.01
-"""Lower bound of the joint's largest acceleration in AGREEMENT, as a fraction of the joint's limit."""
+"""In AGREEMENT, the peak counts as at least this fraction of the joint's limit."""
 JUMP = 1e-6
-"""Largest jump of an acceleration in a motion for which jerks are stated, as a fraction of the joint's
-limit."""
+"""In a motion for which jerks are stated: largest jump of an acceleration, and largest difference of a row's
+acceleration from those of its cubics, as a fraction of the joint's limit (without one, of its peak)."""
 MIN_JERK = 1e-6
 """Jerks below this are rounding errors [rad/s³] or [m/s³]."""
 # Samples at which a motion is tested for passing within a blend: largest distance between them, as a fraction
@@ -474,7 +477,7 @@ BLEND_SHARE = 0.25
 MAX_BLEND_SAMPLES = 10_000
 UNTIMED = "certificates prove nothing about moving obstacles for a path, which has no times"
 MIN_TIME = 1e-12
-"""Smallest time by which a displacement is divided [s], so that mean rates are finite."""
+"""Smallest time by which the tolerance of a mean velocity is divided [s]."""
 
 
 def configurations(motion: Path | Trajectory, between: Values) -> Configurations:
@@ -496,7 +499,7 @@ def deviations(motion: Path | Trajectory, between: Values) -> JointRows:
 
 
 def not_checked(problem: Problem, motion: Path | Trajectory) -> list[str]:
-    """Descriptions of what the checker does not check; only the validator does."""
+    """Descriptions of what the checker does not check. The validator checks sharp reversals."""
     path = isinstance(motion, Path)
     parts = {
         "sharp reversals": True,
@@ -529,15 +532,15 @@ def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
         start_velocity = np.zeros(robot.dof) if problem.start_velocity is None else problem.start_velocity
         yield from _rate_errors(robot, motion, certificate, start_velocity)
         yield from frame_speed_errors(problem, motion, tolerances.rate_slack)
-        yield from _jerk_errors(robot, motion, certificate)
+    yield from _jerk_errors(robot, motion, certificate)
     yield from _constraint_errors(problem, certificate)
     yield from _torque_errors(problem, certificate)
 
 
 def place_errors(problem: Problem, certificate: MotionProof) -> list[str]:
-    """Errors that would make all other tests meaningless: joints of another robot, times that do not begin at
-    0 or do not increase, places in the proof that are outside the motion or given twice, and times of
-    `between` that are those of rows."""
+    """Errors that would make all other tests meaningless: joints of another robot; times that do not begin at
+    0 or do not increase; places in the proof that are outside the motion or appear twice; and places in
+    `between` that are times of rows."""
     motion = certificate.motion
     robot = problem.robot
     if tuple(motion.joint_names) != robot.joint_names:
@@ -547,9 +550,10 @@ def place_errors(problem: Problem, certificate: MotionProof) -> list[str]:
         return [f"motion: its times begin at {times[0]:g} s, not at 0"]
     if not (np.diff(times) > 0).all():
         return ["motion: its times do not increase"]
+    # `looks` is the name of torque_samples in files
     for name, places in (("between", certificate.between), ("looks", certificate.torque_samples)):
         if not ((places > 0) & (places < times[-1])).all() or len(np.unique(places)) < len(places):
-            return [f"motion: the places of `{name}` do not lie between its rows, each once"]
+            return [f"motion: the places of `{name}` must be inside the motion and different from each other"]
     if isinstance(motion, Trajectory) and np.isin(certificate.between, times).any():
         return ["motion: the times of `between` do not lie between its rows"]
     return []
@@ -569,8 +573,9 @@ def cubic_jerks(robot: Robot, motion: Path | Trajectory) -> JointValues | None:
     return cubics.jerks.max(axis=0)
 
 
-def _jerk_errors(robot: Robot, motion: Trajectory, certificate: MotionProof) -> Iterator[str]:
-    """A message for each joint with a larger jerk than the proof states, if the proof states jerks."""
+def _jerk_errors(robot: Robot, motion: Path | Trajectory, certificate: MotionProof) -> Iterator[str]:
+    """If the proof states jerks: a message for each joint with a larger jerk, or a single message if they are
+    those of other joints or the motion has no `cubic_jerks`."""
     stated = dict(certificate.jerks)
     if not stated:
         return
@@ -579,7 +584,7 @@ def _jerk_errors(robot: Robot, motion: Trajectory, certificate: MotionProof) -> 
         return
     max_jerks = cubic_jerks(robot, motion)
     if max_jerks is None:
-        yield "jerks: accelerations jump, or are not those of the cubics"
+        yield "jerks: the motion is a path, or its accelerations jump or are not those of the cubics"
         return
     for name, jerk in zip(stated, max_jerks, strict=True):
         if not jerk <= stated[name] * (1 + BOUND_TOLERANCE) + MIN_JERK:
@@ -616,7 +621,8 @@ def _waypoint_errors(problem: Problem, motion: Path | Trajectory, tolerances: To
 
 def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     """A message for each torque bound that differs from the bound in the proof, and for each torque that is
-    not proved to be within its limit with the payload."""
+    not proved to be within its limit with the payload; a single message if the proof has torques of other
+    joints, or torques without a payload in the problem."""
     motion = certificate.motion
     stated = certificate.torques
     if problem.payload is None:
@@ -646,7 +652,7 @@ def _stated_errors(
     limits: Iterable[float],
 ) -> Iterator[str]:
     """A message for each bound that differs from the bound in the proof, and for each bound that exceeds its
-    limit."""
+    limit; a single message if the proof has bounds with other names."""
     if [name for name, _ in stated] != [*names]:
         yield f"{what}: they are not those of the problem"
         return
@@ -660,9 +666,9 @@ def _stated_errors(
 def _rate_errors(
     robot: Robot, motion: Trajectory, certificate: MotionProof, start_velocity: JointValues
 ) -> Iterator[str]:
-    """A message for each joint that exceeds a velocity or acceleration limit, by any of several measures; if
-    cubics leave the certified straight lines; and if the motion does not begin at the required velocity or
-    end at rest."""
+    """A message for each joint that exceeds a velocity or acceleration limit, by any of several measures, or
+    whose accelerations are not near those of its cubics; if cubics leave the certified straight lines; and if
+    the motion does not begin at the required velocity or end at rest."""
     tolerances = certificate.tolerances
     times = motion.times
     step = np.diff(times)[:, None]
@@ -713,9 +719,10 @@ def _rate_errors(
         spacing = (before + after) / 2
         # second divided difference: by the mean value theorem, the joint reaches this acceleration
         mean_acceleration = np.abs((rows[last] - q) / after - (q - rows[first]) / before) / spacing
+        # number of neighbors outside the motion, whose velocity may be off by rate_slack
         outside = ((first == 0) * 1.0 + (last == len(at) - 1))[:, None]
         slack = position_slack / before + position_slack / after + outside * tolerances.rate_slack * speed
-        quantity = "mean acceleration by its positions"
+        quantity = "mean acceleration computed from positions"
         lines = [
             *_exceeded(
                 robot, quantity, mean_acceleration, acceleration, rate_factor * acceleration + slack / spacing
@@ -749,8 +756,8 @@ def _exceeded(
 def _excess_displacement(
     motion: Trajectory, rate_factor: float, position_slack: float, speed: JointValues
 ) -> JointRows:
-    """For each joint, the largest excess of its displacement between two rows over what its velocity limit
-    allows in the time between them, over all pairs of rows [1, dof].
+    """For each joint, by how much its displacement between two rows exceeds what its velocity limit allows in
+    the time between them: the largest value of all pairs of rows [1, dof].
 
     For each step between the two rows, a tolerance of `position_slack` is allowed; proportionally less for a
     step shorter than the first averaging window. The caller allows this tolerance once more, for the two rows
@@ -769,7 +776,7 @@ def _excess_displacement(
 def _agreement_errors(
     robot: Robot, motion: Trajectory, cubics: Cubics, start_velocity: JointValues, acceleration_slack: ndarray
 ) -> Iterator[str]:
-    """A message for each joint with an acceleration at a row that is further than AGREEMENT from the interval
+    """A message for each joint with an acceleration at a row that is further than AGREEMENT from the range
     between those of the cubics before and after the row."""
     before = np.concatenate([cubics.start[:1], cubics.end])
     after = np.concatenate([cubics.start, cubics.end[-1:]])
@@ -788,9 +795,7 @@ def _agreement_errors(
         yield f"motion: accelerations of {robot.joint_names[j]} are {excess}"
 
 
-def at_goal(
-    robot: Robot, goal: Goal, q: Configurations, tolerances: Tolerances, blend: float = 0.0
-) -> Bool[ndarray, "n"]:
+def at_goal(robot: Robot, goal: Goal, q: Configurations, tolerances: Tolerances, blend: float = 0.0) -> Mask:
     """Whether each configuration reaches a goal, or is within `blend` of it.
 
     blend: for a joint goal, a distance in joint space [rad, L2]; for a pose, the distance of positions [m],

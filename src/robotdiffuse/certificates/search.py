@@ -32,7 +32,7 @@ from robotdiffuse.certificates.bounds import (
     Surface,
     gaps,
 )
-from robotdiffuse.certificates.certificate import Certificate
+from robotdiffuse.certificates.certificate import RATE_ROWS, Certificate
 from robotdiffuse.certificates.kinematics import cubics_of, places_of
 from robotdiffuse.certificates.proof import (
     DECIMALS,
@@ -215,6 +215,9 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         raise InputError(UNTIMED)
     if report.violation is not None:
         raise NotValidError(f"the motion is not valid: {report.violation.line}")
+    # files hold float64: bounds computed in float32, as of PyTorch's rows, would differ from those checked
+    names = ("positions", *(RATE_ROWS if isinstance(motion, Trajectory) else ()))
+    motion = replace(motion, **{name: np.asarray(getattr(motion, name), np.float64) for name in names})
     required = {
         SCENE: CLEARANCE_SHARE * (report.scene_clearance or 0.0),
         "": CLEARANCE_SHARE * (report.self_clearance or 0.0),
@@ -250,7 +253,8 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     if problem.moving and isinstance(motion, Trajectory):
         times = places_of(motion, between)
         moving, moving_margins = _prove(MovingProver(problem.robot, problem.moving, q, times, off), {"": 0.0})
-        margins[SCENE] = min(margins[SCENE], *moving_margins.values())  # SCENE: an obstacle named "scene"
+        # moving_margins[SCENE] is that of a moving obstacle with the name "scene", if there is one
+        margins[SCENE] = min(margins[SCENE], *moving_margins.values())
     record = None
     with suppress(InputError):  # the robot may have been made in this program, and have no file
         record = problem_record(problem)

@@ -21,8 +21,9 @@ _NO_BOX_CORNER = np.float32(EMPTY_BOX[0, 0])
 
 @inner_kernel()
 def _scene(empty, floors, floor, kinds, params, solids, around):
-    """Writes a packed scene to the buffers `solids` and `around` and returns its SceneArrays. The floor,
-    row `floor` of `floors`, is the first solid; with `floor` = -1 there is no floor."""
+    """Writes a packed scene to the buffers `solids` and `around`, and returns its SceneArrays, whose
+    docstrings describe their rows. `floor` is the row of `floors` that becomes the first solid; -1: no
+    floor."""
     n = 0
     if floor >= 0:
         solids[0] = floors[floor]
@@ -69,7 +70,9 @@ def _scene(empty, floors, floor, kinds, params, solids, around):
 
 @kernel(nogil=True)
 def _packed_gradients(robot, empty, floors, floor, kinds, params, q, limit, margin):
-    fixed = np.searchsorted(robot.frame, 1)
+    """The results of `packed_clearances_and_gradients`; the arguments from `empty` to `params` are what
+    `_arrays` returns."""
+    fixed = np.searchsorted(robot.frame, 1)  # number of links that are fixed to the base; they come first
     obstacles = kinds.shape[1] + 1
     out = np.empty((q.shape[0], q.shape[1], len(robot.frame) - fixed), np.float32)
     gradients = np.empty(q.shape, np.float32)

@@ -23,9 +23,9 @@ class CollisionChecker:
     inside without touching the surface.
     """
 
-    def __init__(self, robot: Robot, scene: Scene, padding: float = 0.0) -> None:
-        """`padding` [m] is added to the spheres' radii for checks against the scene."""
-        self.robot, self.scene, self.padding = robot, scene, np.float32(padding)
+    def __init__(self, robot: Robot, scene: Scene) -> None:
+        self.robot = robot
+        self.scene = scene
         self.robot_arrays = compile_robot(robot)
         self.scene_arrays = compile_scene_for(robot, scene)
 
@@ -42,7 +42,7 @@ class CollisionChecker:
 
     def free(self, q: Float[ndarray, "n dof"]) -> Bool[ndarray, "n"]:
         """Whether each configuration is free of collision."""
-        return lane_collision.free_many(self.robot_arrays, self.scene_arrays, self._rows(q), self.padding)
+        return lane_collision.free_many(self.robot_arrays, self.scene_arrays, self._rows(q), np.float32(0.0))
 
     def link_clearances(self, q: Float[ndarray, "n dof"], limit: float = 1.0) -> Float[ndarray, "n links"]:
         """Signed distance of each moving link to the scene [m], at most `limit`; a smaller `limit` is faster.
@@ -50,7 +50,7 @@ class CollisionChecker:
         Distances to point clouds and meshes are at most 0.3 m; above 0.1 m, they are only lower bounds.
         """
         arrays = self.robot_arrays, self.scene_arrays
-        return lane_clearance.link_clearances(*arrays, self._rows(q), np.float32(limit)) - self.padding
+        return lane_clearance.link_clearances(*arrays, self._rows(q), np.float32(limit))
 
     def clearances_and_gradients(
         self, q: Float[ndarray, "n dof"], limit: float, margin: float
@@ -61,14 +61,13 @@ class CollisionChecker:
         scene contributes h = max(0, margin - D). Violation and gradient are 0 where no sphere is within
         `margin` [m].
         """
-        links, gradients = collision_cost.clearances_and_gradients(
+        return collision_cost.clearances_and_gradients(
             self.robot_arrays,
             self.scene_arrays,
             self._rows(q),
             np.float32(limit),
-            np.float32(margin) + self.padding,
+            np.float32(margin),
         )
-        return links - self.padding, gradients
 
     def pair_clearances(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n pairs"]:
         """Signed distance between the spheres of each checked pair of links [m], at most 1 m; 1 m where the
@@ -87,7 +86,7 @@ class CollisionChecker:
             self.robot_arrays,
             self.scene_arrays,
             self._rows(q),
-            np.float32(margin) + self.padding,
+            np.float32(margin),
             np.float32(self_margin),
         )
 

@@ -9,11 +9,12 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.convex_bounds import Hulls, Solids
 from robotdiffuse.core.transforms import ball_around, placed, transform
+from robotdiffuse.core.types import Points, Pose, Vector
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -39,11 +40,11 @@ class Part(NamedTuple):
     `rounding`."""
 
     frame: int
-    vertices: Float[ndarray, "v 3"]
+    vertices: Points
     faces: Int[ndarray, "f 3"]
     """Triangles of the hull; empty for a ball, which has one vertex."""
     rounding: float
-    center: Float[ndarray, "3"]
+    center: Vector
     """Center of a ball around the part."""
     radius: float
 
@@ -52,8 +53,8 @@ class Solid(NamedTuple):
     """A scene shape as the Minkowski sum of a box, a disc around its z axis and a ball."""
 
     shape: Shape
-    T_base_box: Float[ndarray, "4 4"]
-    half: Float[ndarray, "3"]
+    T_base_box: Pose
+    half: Vector
     """Half edge lengths of the box [m]."""
     disc: float
     """Radius of the disc [m]."""
@@ -172,7 +173,7 @@ def _solid(shape: Shape) -> Solid | None:
             raise TypeError(f"no collision geometry for a {type(shape).__name__}")
 
 
-def _bounded(shape: Shape, points: Float[ndarray, "n 3"], inflation: float) -> Solid:
+def _bounded(shape: Shape, points: Points, inflation: float) -> Solid:
     low = points.min(axis=0)
     high = points.max(axis=0)
     return Solid(shape, transform((low + high) / 2), (high - low) / 2, 0.0, inflation, True)

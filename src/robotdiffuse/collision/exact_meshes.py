@@ -1,9 +1,13 @@
 """Exact distances between the robot's convex meshes and the scene, by Coal: the validator's geometry.
 
 This geometry does not depend on the covering spheres, so the spheres can be tested against it. Only a link
-without meshes is represented by its spheres. Where the convex parts of two grazing links (`Robot.grazing`)
-touch, their mesh surfaces decide whether the links collide (`collision/surface_pairs.py`). Distances are
-signed [m]: the negative penetration depth inside.
+without meshes is represented by its spheres. Distances are signed [m]: the negative penetration depth inside.
+
+Convex parts fill hollows of a mesh. Where the parts of two grazing links (`Robot.grazing`) nearly touch
+or overlap a little, the triangles of the URDF's meshes decide whether the links collide (`SurfacePair`): the
+triangles must not touch, and no component of one surface may lie inside the other. The distance of the
+surfaces then bounds how far the links can move without contact, since a component cannot get inside without
+touching the surface.
 """
 
 # Coal's Python module has no type information.
@@ -30,24 +34,123 @@ from robotdiffuse.collision.convex_geometry import (
     parts_of,
     solid_arrays,
     solids_of,
+    surfaces_decide,
 )
 from robotdiffuse.collision.kernels import mesh_bounds as kernel
-from robotdiffuse.collision.surface_pairs import MAX_OVERLAP, SurfacePair, surface_pairs
 from robotdiffuse.core.deadline import check_time
-from robotdiffuse.core.transforms import transform
-from robotdiffuse.core.types import for_kernels
+from robotdiffuse.core.transforms import placed, transform
+from robotdiffuse.core.types import Configuration, Pose, Vector, for_kernels
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose, coal_rounded, coal_surface
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Sphere, Triangulated
 
+MAX_OVERLAP = 0.005
+"""Overlap of convex parts beyond which links count as colliding, without a test of their surfaces [m]."""
+RAYS = np.array([[0.6137, 0.5291, 0.5861], [-0.7313, 0.3917, -0.5583], [0.1723, -0.8839, 0.4348]])
+"""Directions of the rays that tell whether a point is inside a surface; oblique, so that few rays run along
+an edge or a face."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Body:
+    """The surface of a link, in the frame that the link is fixed to."""
+
+    frame: int
+    tree: "coal.BVHModelOBBRSS"
+    triangles: Float[ndarray, "f 3 3"]
+    component: Int[ndarray, "f"]
+    """Connected component of each triangle."""
+    points: Float[ndarray, "components 3"]
+    """One point of each component."""
+
+    def inside(self, points: Float[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
+        """Whether each point may be inside a connected component: one of several rays from the point crosses
+        the component an odd number of times. Points in front of an open component can count as inside."""
+        low = self.triangles.min(axis=(0, 1))
+        high = self.triangles.max(axis=(0, 1))
+        enclosed = ((points >= low) & (points <= high)).all(axis=1)
+        for i in np.flatnonzero(enclosed):
+            # `bincount` counts the crossings of each component
+            enclosed[i] = any((np.bincount(self._crossed(points[i], ray)) % 2).any() for ray in RAYS)
+        return enclosed
+
+    def _crossed(self, point: Vector, ray: Vector) -> Int[ndarray, "k"]:
+        """Component of every triangle that a ray from a point crosses."""
+        a, b, c = np.moveaxis(self.triangles - point, 1, 0)
+        # the ray's line crosses a triangle if it passes all three edges on the same side
+        sides = [np.cross(edge_start, edge_end) @ ray for edge_start, edge_end in ((a, b), (b, c), (c, a))]
+        through = np.all([side >= 0 for side in sides], axis=0) | np.all([side < 0 for side in sides], axis=0)
+        normal = np.cross(b - a, c - a)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = np.einsum("fd,fd->f", normal, a) / (normal @ ray)
+        return self.component[through & (along > 0)]
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePair:
+    """The surfaces of two links."""
+
+    first: _Body
+    second: _Body
+
+    def distance(self, frames: Float[ndarray, "frames 4 4"], cutoff: float = np.inf) -> float | None:
+        """Distance of the surfaces [m]; if the distance is larger than `cutoff`, some value of at least
+        `cutoff`. None if the surfaces touch, or a component of one is inside the other."""
+        a = self.first
+        b = self.second
+        T_a = frames[a.frame]
+        T_b = frames[b.frame]
+        places = a.tree, coal_pose(T_a), b.tree, coal_pose(T_b)
+        if coal.collide(*places, coal.CollisionRequest(), coal.CollisionResult()):
+            return None
+        for body, T_body, other_body, T_other in ((a, T_a, b, T_b), (b, T_b, a, T_a)):
+            if body.inside((placed(T_other, other_body.points) - T_body[:3, 3]) @ T_body[:3, :3]).any():
+                return None
+        result = coal.DistanceResult()
+        if np.isfinite(cutoff):
+            result.min_distance = cutoff
+        return float(coal.distance(*places, coal.DistanceRequest(), result))
+
+
+@once_per_robot
+def surface_pairs(robot: Robot) -> dict[Check, SurfacePair]:
+    """The surfaces of each checked pair of grazing links."""
+    bodies: dict[str, _Body] = {}
+    surfaces = {}
+    for check in checks_of(robot):
+        if check.other is None or not surfaces_decide(robot, check):
+            continue
+        for link in (check.link, check.other):
+            if link not in bodies:
+                bodies[link] = _body(robot, link)
+        surfaces[check] = SurfacePair(bodies[check.link], bodies[check.other])
+    return surfaces
+
+
+def _body(robot: Robot, link: str) -> _Body:
+    from scipy.sparse import coo_array  # few robots need it
+    from scipy.sparse.csgraph import connected_components
+
+    T = robot.T_frame_link(link)
+    surface = robot.surfaces[link]
+    vertices = placed(T, surface.vertices)
+    faces = surface.faces
+    edge_ends = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
+    edges = coo_array((np.ones(len(edge_ends[0]), bool), edge_ends), (len(vertices),) * 2)
+    _, vertex_component = connected_components(edges, directed=False)
+    _, first, component = np.unique(vertex_component[faces[:, 0]], return_index=True, return_inverse=True)
+    points = vertices[faces[first, 0]]
+    return _Body(robot.link_frame(link), coal_surface(vertices, faces), vertices[faces], component, points)
+
+
 CHUNK_SIZE = 8192
 """Number of configurations that `collides` processes at once, which limits its memory."""
 CLEAR_DISTANCE = 1e-6
 """`collides` does not compute distances beyond this [m]."""
 RESTING_DEPTH = 0.01
-"""Penetration of a held object in an obstacle below which the message says how to allow the contact [m]."""
+"""If a held object penetrates an obstacle less deeply, the message says how to allow the contact [m]."""
 MAX_CONTACTS = 200
 """Largest number of triangles or points of one obstacle from which the penetration of a link is computed;
 1,000 would take 5 ms."""
@@ -67,7 +170,7 @@ class _Piece(NamedTuple):
 
     geometry: coal.CollisionGeometry
     frame: int
-    T_frame_piece: Float[ndarray, "4 4"] | None
+    T_frame_piece: Pose | None
     """None if the geometry is given in the frame already."""
 
 
@@ -122,7 +225,7 @@ def _obstacle(solid: Solid) -> _Obstacle:
 @lru_cache(maxsize=16)
 def _tree(shape: Triangulated | PointCloud) -> coal.BVHModelOBBRSS:
     """Coal's bounding volume tree over a surface or a point cloud. It is cached because scenes share shapes,
-    and 100,000 points take half a second."""
+    and 100,000 points take 0.4 s."""
     if isinstance(shape, PointCloud):
         # Each point is a triangle of zero size: Coal's tree then prunes 100,000 points in about 0.1 ms.
         vertices = shape.distinct_points
@@ -296,8 +399,8 @@ class ExactCollision:
 
         It is the distance of their convex parts, or the distance of their mesh surfaces if that is larger.
         The surfaces count only if the signed distance of the parts is between -MAX_OVERLAP and
-        SURFACES_BELOW, and if the surfaces neither touch nor enclose a piece of each other. Without `depth`,
-        the penetration may be too small, but the sign is right.
+        SURFACES_BELOW, and if the surfaces neither touch nor enclose a component of each other. Without
+        `depth`, the penetration may be too small, but the sign is right.
         """
         assert candidates.surfaces is not None
         best, _ = self._closest(candidates, frames, cutoff, -np.inf if depth else -MAX_OVERLAP, depth)
@@ -306,17 +409,15 @@ class ExactCollision:
         surface_distance = candidates.surfaces.distance(frames, cutoff)
         return best if surface_distance is None else min(max(best, surface_distance), cutoff)
 
-    def link_distances(self, q: Float[ndarray, "dof"]) -> tuple[Distance, ...]:
+    def link_distances(self, q: Configuration) -> tuple[Distance, ...]:
         """Signed distance of every moving link to the nearest obstacle [m], infinite in an empty scene."""
         return self._all(q, range(len(self.links)))
 
-    def pair_distances(self, q: Float[ndarray, "dof"]) -> tuple[Distance, ...]:
+    def pair_distances(self, q: Configuration) -> tuple[Distance, ...]:
         """Signed distance of every checked pair of links [m], negative where they overlap."""
         return self._all(q, range(len(self.links), len(self.checks)))
 
-    def distance_from_moved_base(
-        self, link: str, q: Float[ndarray, "dof"], T: Float[ndarray, "4 4"]
-    ) -> float:
+    def distance_from_moved_base(self, link: str, q: Configuration, T: Pose) -> float:
         """Signed distance of a link to the nearest obstacle [m] after the whole robot, base included, is
         moved by T. This equals the distance to obstacles that are moved by the inverse of T."""
         frames = T @ forward_frames(self.robot, q[None])[0]
@@ -346,8 +447,7 @@ class ExactCollision:
         result = coal.CollisionResult()
         for candidates in self._candidates:
             undecided = np.flatnonzero(~hit)
-            lower = candidates.lower(frames[undecided])
-            rows, columns = np.nonzero(lower <= 0)
+            rows, columns = np.nonzero(candidates.lower(frames[undecided]) <= 0)
             separated = np.zeros(len(q), bool)  # grazing links with overlapping parts and separate surfaces
             for row, column in zip(undecided[rows].tolist(), columns.tolist(), strict=True):
                 if hit[row] or separated[row]:
@@ -375,14 +475,14 @@ def warm_up(robot: Robot) -> None:
     explain_collision(robot, Scene([Sphere([0.0, 0.0, 100.0], 1.0)]), (robot.lower + robot.upper) / 2)
 
 
-def contacts_at(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> list[Distance]:
+def contacts_at(robot: Robot, scene: Scene, q: Configuration) -> list[Distance]:
     """The links that touch an obstacle or another link at a configuration, the deepest contact first."""
     exact = ExactCollision(robot, scene)
     checks = (*exact.link_distances(q), *exact.pair_distances(q))
     return sorted((check for check in checks if check.distance <= 0), key=lambda check: check.distance)
 
 
-def explain_collision(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> str | None:
+def explain_collision(robot: Robot, scene: Scene, q: Configuration) -> str | None:
     """The deepest collision at a configuration in words: 'panda_link5 is 3.2 cm inside sphere_2'.
 
     None if the exact meshes are free of collision.

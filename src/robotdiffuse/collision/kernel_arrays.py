@@ -66,8 +66,8 @@ class RobotArrays(NamedTuple):
     bounds: ndarray
     """[groups, 4] a sphere around all spheres of the group."""
     pairs: ndarray
-    """[pairs, 4] two groups that are checked against each other, the row of `pair_tables` for this pair or
-    -1, and the pair's bit in the cells of that table."""
+    """[pairs, 4] two groups that are checked against each other; the table in `pair_tables` for this pair, -1
+    if there is none; and the bit that this pair has in each cell of that table, as an integer."""
     pair_tables: ndarray
     """[tables, ...] joint values at which pairs may touch: see `sphere_pair_tables.py`."""
     parents: ndarray | None
@@ -78,10 +78,10 @@ class SceneArrays(NamedTuple):
     """Obstacles: solids, and points in a grid."""
 
     solids: ndarray
-    """[n, 17] Minkowski sums of a box, a disc about its z axis and a ball: center, base-to-shape rotation
-    (row-major), half edges, radius of the ball, and 1 for a cylinder, else 0. The first two half edges of a
-    cylinder are its radius. Point clouds and meshes that links may touch are covered by balls, which are
-    solids here."""
+    """[n, 17] center; base-to-shape rotation (row-major); half edges of a box; radius of a ball; 1 for a
+    cylinder, else 0. A solid is the box, widened by the ball (Minkowski sum). For a cylinder, the first two
+    half edges are the radius of a disc that replaces the rectangle. Point clouds and meshes that links may
+    touch are covered by balls, which are solids here."""
     solid_boxes: ndarray
     """[rows, 6 * 16] axis-aligned boxes around the solids in rows of sixteen boxes: 16 times the lower x,
     then lower y, lower z, upper x, upper y and upper z."""
@@ -129,6 +129,7 @@ def compile_robot(robot: Robot) -> RobotArrays:
         offsets=np.ascontiguousarray(offsets, np.float32),
         spheres=np.concatenate(spheres).astype(np.float32) if spheres else np.zeros((0, 4), np.float32),
         first=np.cumsum([0] + [len(s) for s in spheres]).astype(np.int32),
+        # NO_SPHERES adds no row; it makes the array of a robot without spheres
         rows=np.concatenate([by_sixteen(row, row[-1:]) for row in [NO_SPHERES, *rows]]),
         row_bounds=np.array(
             [row for link_rows in placed_groups for row in link_rows.row_bounds], np.float32
@@ -180,11 +181,12 @@ def _placed_groups(robot: Robot) -> dict[str, _Group]:
     group_of_link = {} if robot.bare is None else dict(_placed_groups(robot.bare))
     links = [link for link in robot_groups(robot) if link not in group_of_link]
     link_spheres = []
-    parts = []
+    parts = []  # the rows of each link
     for link in links:
         link_spheres.append(moved_spheres(robot.T_frame_link(link), robot.spheres[link]))
         parts.append(_clusters(link_spheres[-1]))
     bounds = bounding_spheres([*link_spheres, *(part for group in parts for part in group)])
+    # the bounds of the links come first, then those of all their rows
     part_bounds = iter(bounds[len(link_spheres) :])
     for link, spheres, rows, bound in zip(links, link_spheres, parts, bounds, strict=False):
         group_of_link[link] = _Group(spheres, rows, bound, list(islice(part_bounds, len(rows))))
@@ -294,7 +296,7 @@ def _rows(solids: Sequence[Solid], reach: float) -> ndarray:
     T = np.array([solid.T_base_box for solid in solids]).reshape(-1, 4, 4)
     sizes = np.array([[*solid.half, solid.disc, solid.rounding] for solid in solids]).reshape(-1, 5)
     R = T[:, :3, :3]
-    half = sizes[:, :3]
+    half = sizes[:, :3]  # a view: what changes `half` changes `sizes`, and the other way round
     # crop each box to coordinates within `far` of the base's origin
     far = 2 * reach + 1
     base = -np.einsum("nij,ni->nj", R, T[:, :3, 3])

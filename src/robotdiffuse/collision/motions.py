@@ -11,7 +11,7 @@ links contribute. Clearances are first computed from the covering spheres, for m
 give the bound (`kernels/convex_bounds.py`). Coal computes distances to surfaces and point clouds, and decides
 whether bodies touch."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -43,7 +43,7 @@ from robotdiffuse.collision.kernels.motion_pieces import Motion, Pieces
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.core.loading import loading
 from robotdiffuse.core.transforms import ball_around
-from robotdiffuse.core.types import for_kernels
+from robotdiffuse.core.types import Configurations, JointValues, for_kernels
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot
@@ -71,13 +71,9 @@ def search_space(
     padding: float = 0.0,
     near_ends: Float[ndarray, "m columns"] | None = None,
 ) -> Space:
-    """The arguments of a compiled search; `resolution` [m] as in `Space`.
-
-    `padding` [m] and the paddings in the last column of `near_ends` are in addition to the checker's padding.
-    """
+    """The arguments of a compiled search; `resolution`, `padding` and `near_ends` as in `Space`."""
     robot = checker.robot
-    ends = np.zeros((0, robot.dof + 1)) if near_ends is None else near_ends.copy()
-    ends[:, -1] += checker.padding
+    ends = np.zeros((0, robot.dof + 1)) if near_ends is None else near_ends
     return Space(
         checker.robot_arrays,
         checker.scene_arrays,
@@ -85,7 +81,7 @@ def search_space(
         robot.upper.astype(np.float32),
         largest_motion_radii(robot),
         np.float32(resolution),
-        checker.padding + np.float32(padding),
+        np.float32(padding),
         ends.astype(np.float32),
     )
 
@@ -96,7 +92,7 @@ def finer_resolution(resolution: float) -> float:
     return max(resolution / 2, FINEST_RESOLUTION)
 
 
-def largest_motion_radii(robot: Robot) -> Float[ndarray, "dof"]:
+def largest_motion_radii(robot: Robot) -> JointValues:
     """Largest distance of any point of the arm from each joint's axis [m]; 1 for a prismatic joint."""
     return motion_radii(robot).max(axis=0, initial=0.0).astype(np.float32)
 
@@ -125,23 +121,25 @@ class Sweep(NamedTuple):
     contact."""
 
 
+@dataclass(eq=False)
 class ContinuousCollision:
     """Certifies whole motions of a robot in a scene. Threads may share an object of this class, since calls
     do not change it."""
 
-    def __init__(self, robot: Robot, scene: Scene, contact: float, tightness: float) -> None:
-        """Meshes nearer than `contact` [m] count as touching. Pieces are split until the certified clearance
-        to the scene is at least the fraction `tightness`, in (0, 1), of the smallest measured clearance to
-        the scene. The same is done for the clearance between links."""
-        self.robot = robot
-        self.scene = scene
-        self.contact = contact
-        self.tightness = tightness
-        self.arm, self.checks = _arm(robot), _checks(robot)
-        self.scene_arrays = compile_scene_for(robot, scene)
-        self.solids = solid_arrays(robot, scene)
+    robot: Robot
+    scene: Scene
+    contact: float
+    """Meshes nearer than this [m] count as touching."""
+    tightness: float
+    """Pieces are split until the certified clearance to the scene is at least this fraction, in (0, 1), of
+    the smallest measured clearance to the scene. The same is done for the clearance between links."""
 
-    def sweep(self, q: Float[ndarray, "n dof"]) -> Sweep:
+    def __post_init__(self) -> None:
+        self.arm, self.checks = _arm(self.robot), _checks(self.robot)
+        self.scene_arrays = compile_scene_for(self.robot, self.scene)
+        self.solids = solid_arrays(self.robot, self.scene)
+
+    def sweep(self, q: Configurations) -> Sweep:
         """Certify the motion along straight lines in joint space through the waypoints (at least one)."""
         q = for_kernels(q)
         motion = Motion(q, motion_pieces.travel_along(q, self.checks.motion_radii))
@@ -307,8 +305,7 @@ def with_covering_spheres(robot: Robot) -> Robot:
     added = {}
     for link, meshes in robot.meshes.items():
         if len(meshes) and not len(robot.spheres.get(link, ())):
-            vertices = np.concatenate([mesh.vertices for mesh in meshes])
-            center, radius = ball_around(vertices)
+            center, radius = ball_around(np.concatenate([mesh.vertices for mesh in meshes]))
             added[link] = np.array([[*center, radius]])
     return replace(robot, spheres=robot.spheres | added) if added else robot
 
@@ -317,7 +314,7 @@ MAX_SWEEPS = 5000
 """Largest number of times that `contacts` checks the remaining motion for the next contact."""
 
 
-def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: float) -> list[Contact]:
+def contacts(robot: Robot, scene: Scene, q: Configurations, contact: float) -> list[Contact]:
     """All contacts along straight lines through waypoints, in order.
 
     A contact begins where two bodies come nearer than `contact` [m] and lasts until they separate. If a link
@@ -326,7 +323,8 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
     1 cm of motion until no bodies are in contact.
     """
     validator = ContinuousCollision(robot, scene, contact, 0.5)
-    motion = Motion(for_kernels(q), motion_pieces.travel_along(q, validator.checks.motion_radii))
+    q = for_kernels(q)
+    motion = Motion(q, motion_pieces.travel_along(q, validator.checks.motion_radii))
     end = float(motion.travel[-1])
     at = 0.0
     contacts_in_order = list[Contact]()

@@ -30,8 +30,7 @@ from robotdiffuse.core.types import Values, for_kernels, interpolated
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.motion_bounds import radii_of
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.moving_obstacles import MovingObstacle, track_speeds
-from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene import MovingObstacle, Scene, track_speeds
 
 if TYPE_CHECKING:
     from robotdiffuse.collision.exact_meshes import ExactCollision
@@ -98,7 +97,8 @@ class MovingCollision:
                     continue
                 time = (start + stop) / 2
                 distance = self._distance(link, o, times, q, time)
-                if distance <= self.contact or stop - start < MIN_INTERVAL:
+                # an interval of one time is proved by the distance alone
+                if distance <= self.contact or 0 < stop - start < MIN_INTERVAL:
                     if hit is None or time < hit[0]:
                         hit = time, link, o
                     if stop - start > 2 * CONTACT_TIME_TOLERANCE:

@@ -1,9 +1,9 @@
-"""Tables of the joint values at which two links may touch that have only one or two joints between them.
+"""Tables of the joint values at which two links with only one or two joints between them may touch.
 
 The relative pose of two links depends only on the joints between them. For links with one or two joints
 between them, such as forearm and hand, bounding spheres overlap almost always. A table over these joints says
 at which joint values the links may touch: one look-up replaces hundreds of distances. Tables are computed
-from the spheres. If the robot has a table of the links' convex parts (`robots/fitting/sampled_links.py`),
+from the spheres. If the robot has a table of the links' convex parts (`robots/fitting/self_collisions.py`),
 cells that are proved free there are free here too.
 """
 

@@ -34,8 +34,7 @@ def _import_pybullet() -> None:
 
 _import_pybullet()
 
-from robotdiffuse.simulation.replay import Replay, ReplayContact, ReplaySettings, replay  # noqa: E402
 from robotdiffuse.simulation.validator import OracleContact, PyBulletOracle  # noqa: E402
-from robotdiffuse.simulation.world import World  # noqa: E402
+from robotdiffuse.simulation.world import Replay, ReplayContact, ReplaySettings, World, replay  # noqa: E402
 
 __all__ = ["OracleContact", "PyBulletOracle", "Replay", "ReplayContact", "ReplaySettings", "World", "replay"]

@@ -65,7 +65,8 @@ def rate_violations(
             time = float(trajectory.times[i])
             if check.kind not in first_violations or time < first_violations[check.kind].time:
                 name = robot.joint_names[j]
-                rate = float(check.rates[i, j]) if check.kind == "rates" else abs(float(check.rates[i, j]))
+                signed = check.kind in ("rates", "rest")
+                rate = float(check.rates[i, j]) if signed else abs(float(check.rates[i, j]))
                 message = f"{name} at {time:.3f} s: its {check.what} is {rate:.6g}, {check.expected(i, j)}"
                 first_violations[check.kind] = Violation(
                     check.kind, time, message, name, None, float(beyond[i, j])
@@ -114,11 +115,15 @@ def _checks(
         return _Check(kind, what, rates, np.abs(rates), allowed, lambda _, j: f"its limit {limit[j]:.6g}")
 
     at_ends = np.zeros_like(v)
-    at_ends[0], at_ends[-1] = np.abs(v[0] - initial_velocity), np.abs(v[-1])
-    rule = "but motions begin and end at rest"
-    if initial_velocity.any():
-        rule = "but the motion is to begin at the problem's start_velocity and end at rest"
-    yield _Check("rest", "velocity", v, at_ends, rest_tolerance, lambda *_: rule)
+    at_ends[0] = np.abs(v[0] - initial_velocity)
+    at_ends[-1] = np.maximum(at_ends[-1], np.abs(v[-1]))  # a single row is the start and the end
+
+    def rule(_: int, j: int) -> str:
+        if not initial_velocity.any():
+            return "but motions begin and end at rest"
+        return f"but the motion is to begin at the start_velocity {initial_velocity[j]:.6g} and end at rest"
+
+    yield _Check("rest", "velocity", v, at_ends, rest_tolerance, rule)
 
     yield limited("jump", "mean velocity from here to the next row", mean, mean_error)
     # An error e of the mean velocity of a step of h seconds changes the cubic's velocities by up to 3/2 e,
@@ -127,9 +132,9 @@ def _checks(
     yield limited("velocity", rate_name, cubics.extremes.velocity, 1.5 * mean_error)
     yield limited("velocity", "velocity", v)
 
-    # Second differences of positions. A step as long as its neighbor is added at each end. The mean
-    # velocities
-    # of both steps average to `initial_velocity` (before the first row) or 0 (after the last).
+    # Second differences of positions. At each end, a step as long as its neighbor is added. The mean
+    # velocities of the added step and its neighbor average to `initial_velocity` (before the first row) or 0
+    # (after the last).
     means = _padded(2 * initial_velocity - mean[:1], mean, -mean[-1:])
     durations = _padded(step[:1], step, step[-1:])
     uncertainty = _padded(mean_error[:1], mean_error, mean_error[-1:])

@@ -22,9 +22,9 @@ class Violation:
     other: str | None = None
     """The obstacle, the other link or the kind of constraint."""
     excess: float | None = None
-    """Amount of the violation, in its own unit. For a contact, its greatest depth [m]; for a constraint, the
-    greatest excess over its limit until it is met again; for a step by nearly a whole turn, the size of the
-    step; otherwise the excess over a limit, or the error at start or goal."""
+    """Amount of the violation, in its own unit: for a contact, its greatest depth [m]; for a constraint, the
+    greatest excess over its limit until the motion meets it again; for a step by nearly a whole turn, the
+    size of the step; for other kinds, the excess over a limit, or the error at start or goal."""
 
     @property
     def line(self) -> str:
@@ -51,8 +51,8 @@ class Report:
     acceleration is not 0 at the start or the end. Jerk limits are no requirement: a motion with a share above
     1 is valid, but some controllers refuse it."""
     found: tuple[Violation, ...] = ()
-    """All violations that were found, the first of each kind; the function `violations` finds every
-    contact."""
+    """All violations that were found: the first of each kind, but up to two of the kinds jump, limits and
+    scene_collision. The function `violations` finds every contact."""
 
     @property
     def min_clearance(self) -> float | None:

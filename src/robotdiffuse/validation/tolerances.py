@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
 from numpy import ndarray
 
 from robotdiffuse.core.settings import Bound, Natural, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import inverse, rotation_angle, rpy_from_rotation
-from robotdiffuse.core.types import Configuration, Configurations, JointRows, Pose, Values, interpolated
+from robotdiffuse.core.types import Configuration, Configurations, JointRows, Mask, Pose, Values, interpolated
 from robotdiffuse.problems.problem import AnyGoal, Goal, JointGoal, PosesGoal, goals_of
 from robotdiffuse.robots.robot import Robot
 
@@ -37,8 +36,8 @@ class VerifySettings(Settings, name="verify"):
     """At a waypoint where the motion must stop, no joint may be faster than this [rad/s] or [m/s]."""
     rate_slack: NotNegative = 0.01
     """Fraction by which a trajectory may exceed velocity, acceleration, effort and speed limits. A velocity
-    may also differ by this fraction of its limit from the velocity that the positions give, and from zero at
-    the start and the end."""
+    may also differ by this fraction of its limit from the velocity that the positions give, from the
+    problem's `start_velocity` (or zero) at the start, and from zero at the end."""
     rate_agreement: NotNegative = 0.5
     """How far a row's acceleration may be outside of the interval between those that the cubics before and
     after it have there, as a fraction of the joint's greatest acceleration."""
@@ -187,13 +186,10 @@ def sample_path(q: Configurations, step: float, after: float = 0.0) -> tuple[Val
     shares = [np.arange(count) / count for count in counts]
     places = np.append(np.repeat(np.arange(len(counts)), counts) + np.concatenate([[], *shares]), len(counts))
     places = places[places >= after]
-    rows = np.arange(float(len(q)))
-    return places, interpolated(places, rows, q)
+    return places, interpolated(places, np.arange(float(len(q))), q)
 
 
-def _near(
-    robot: Robot, goal: Goal, q: Configurations, blend: float, settings: VerifySettings
-) -> Bool[ndarray, "n"]:
+def _near(robot: Robot, goal: Goal, q: Configurations, blend: float, settings: VerifySettings) -> Mask:
     """Whether each configuration may be within `blend` of a goal; orientations of poses are not checked."""
     if isinstance(goal, AnyGoal):
         return np.any([_near(robot, part, q, blend, settings) for part in goal.goals], axis=0)

@@ -1,53 +1,197 @@
 """The validator: whether a motion is free of collision, within limits, and leads from the start to the goal.
 
 Freedom from collision between waypoints is certified, not sampled: see collision/motions.py. A trajectory is
-validated along the cubics that controllers execute between its rows: see trajectories/cubics.py and rates.py.
-The validator does not depend on planners.
+validated along the cubics that controllers execute between its rows: see trajectories/cubics.py and
+validation/rates.py. The validator does not depend on planners.
+
+Of joint torques and frame speeds, the validator finds the first value that exceeds its limit, or proves that
+no value does. A motion consists of pieces, on which positions are straight or cubic and torques are smooth.
+Values are computed at both ends of a piece. Bounds on their second derivatives (see robots/dynamics.py) bound
+the values in between. If such a bound exceeds the limit, the piece is halved.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import describe_contact
-from robotdiffuse.collision.motions import Contact, ContinuousCollision
+from robotdiffuse.collision.motions import Contact, ContinuousCollision, contacts
 from robotdiffuse.core.errors import (
     MAX_COORDINATE,
     InputError,
     check_type,
     counted,
     distinct,
-    joined,
     shown,
     within,
 )
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.types import ROWS, Path, Trajectory, for_kernels
+from robotdiffuse.core.types import ROWS, Configurations, JointRows, Path, Trajectory, Values, for_kernels
 from robotdiffuse.problems.problem import Problem, check_problem
-from robotdiffuse.robots.dynamics import Dynamics
+from robotdiffuse.robots.dynamics import Dynamics, Stretches
+from robotdiffuse.robots.robot import check_joints
+from robotdiffuse.scenes.scene import MAX_DURATION
 from robotdiffuse.trajectories.cubics import Cubics
 from robotdiffuse.trajectories.speed_limits import jerk_limits
 from robotdiffuse.validation.rates import rate_violations
 from robotdiffuse.validation.report import Report, Violation
 from robotdiffuse.validation.tolerances import DEFAULT, VerifySettings, first_place_within, goal_error
-from robotdiffuse.validation.torques import (
-    Pieces,
-    first_beyond,
-    first_excess,
-    static_pieces,
-    trajectory_pieces,
-)
 
 if TYPE_CHECKING:  # modules for features that few problems have are imported when they are needed
     from robotdiffuse.collision.moving_obstacles import MovingCollision, TimedContact
     from robotdiffuse.problems.compiled_constraints import PathConstraints
 
-MAX_DURATION = 1e5
-"""Longest motion that is validated, about a day [s]."""
+RESOLUTION = 1e-3
+"""A piece is not halved further once its values are known to this fraction of their limits. If a value may
+still exceed its limit then, it counts as exceeding it."""
+MAX_OPEN_PIECES = 100_000
+"""Maximum number of pieces that are halved at once. If there are more, as in motions with very many turns,
+each value that is not proved to be within its limit counts as exceeding it."""
+PLACE_RESOLUTION = 1 / 64
+"""Resolution of the place where a value first exceeds its limit, as a fraction of a step from row to row."""
+States = tuple[JointRows, JointRows, JointRows]
+"""Positions, velocities and accelerations."""
+
+
+class Pieces(NamedTuple):
+    """The pieces of a motion, from each row to the next."""
+
+    states: Callable[[Int[ndarray, "n"], Values], States]
+    """States at places. A place is the index of a piece, and a share: the fraction of the piece that has
+    passed."""
+    along: Stretches
+    """Bounds on positions and derivatives along each piece; derivatives are with respect to the share."""
+
+
+class Excess(NamedTuple):
+    """The first value that exceeds its limit, or is not proved to be within its limit."""
+
+    place: float
+    """Row, plus the share of the piece after it."""
+    column: int
+    """Index of the joint, or of the frame."""
+    value: float
+    """The torque of the joint [N m] or [N], or the speed of the frame [m/s]."""
+    excess: float
+    """Largest amount found by which this joint or frame exceeds its limit plus the allowed slack, in the unit
+    of `value`. Inside pieces whose two ends exceed the limit, larger amounts are not searched for."""
+
+
+def trajectory_pieces(trajectory: Trajectory) -> Pieces:
+    """Pieces of a trajectory with increasing times: the cubics through its positions and velocities."""
+    if len(trajectory.positions) == 1:
+        return static_pieces(trajectory.positions)
+    cubics = Cubics(trajectory)
+    extremes = cubics.extremes
+    h = cubics.steps
+    change = np.abs(extremes.end - extremes.start)
+    accelerations = np.stack([extremes.acceleration, change, np.zeros_like(change)])
+    max_velocities = extremes.velocity
+    speed = np.stack([max_velocities, h * accelerations[0], h * change])
+    farthest = _farthest(trajectory.positions) + h * max_velocities / 2
+    return Pieces(cubics.states, Stretches(farthest, h * speed, speed, accelerations))
+
+
+def static_pieces(q: Configurations) -> Pieces:
+    """Pieces of a path, on straight lines between waypoints, with zero velocity everywhere."""
+    q = np.repeat(q, 2, axis=0) if len(q) == 1 else q
+    step = np.diff(q, axis=0)
+    still = np.zeros((3, *step.shape))
+
+    def states(piece: ndarray, share: ndarray) -> States:
+        configurations = q[piece] + share[:, None] * step[piece]
+        return configurations, 0 * configurations, 0 * configurations
+
+    v = still.copy()
+    v[0] = np.abs(step)
+    return Pieces(states, Stretches(_farthest(q), v, still, still))
+
+
+def _farthest(q: Configurations) -> JointRows:
+    """Largest absolute position of each joint at the ends of each piece."""
+    return np.maximum(np.abs(q[:-1]), np.abs(q[1:]))
+
+
+def first_excess(dynamics: Dynamics, pieces: Pieces, slack: float) -> Excess | None:
+    """The first torque that exceeds its limit by more than the fraction `slack`; None if it is proved that no
+    torque does."""
+    bends = dynamics.second_derivatives(pieces.along)
+    return first_beyond(dynamics.limits, dynamics.torques, bends, pieces.states, slack)
+
+
+def first_beyond(
+    limits: Values,
+    values: Callable[[ndarray, ndarray, ndarray], ndarray],
+    bends: Float[ndarray, "m k"],
+    states: Callable[[ndarray, ndarray], States],
+    slack: float,
+) -> Excess | None:
+    """The first value along a motion, such as a torque, that exceeds its limit by more than the fraction
+    `slack`; None if it is proved that no value does.
+
+    Args:
+        limits: Limits of k values [k].
+        values: Computes the k values [n, k] from n positions, velocities and accelerations.
+        bends: Bounds on the second derivatives of the values with respect to the share, for each of m pieces.
+        states: `Pieces.states`.
+        slack: Allowed excess, as a fraction of a limit.
+    """
+    allowed = limits * (1 + slack)
+    count = len(bends)
+    piece = np.arange(count)
+    low = np.zeros(count)
+    high = np.ones(count)
+
+    def magnitudes(piece: ndarray, share: ndarray) -> ndarray:
+        return np.abs(values(*states(piece, share)))
+
+    at_low = magnitudes(piece, low)
+    at_high = magnitudes(piece, high)
+    places: list[ndarray] = [np.zeros(0)]
+    beyond: list[ndarray] = [np.zeros((0, len(allowed)))]
+    while len(piece):
+        # between the ends of [low, high], a value is at most the larger end value plus `bulge`
+        bulge = bends[piece] * (high - low)[:, None] ** 2 / 8
+        bound = np.maximum(at_low, at_high)
+        undecided = bound + bulge > allowed
+        low_exceeds = (at_low > allowed).any(axis=1)
+        high_exceeds = (at_high > allowed).any(axis=1)
+        unsure = np.minimum(bulge, RESOLUTION * limits)
+        resolved = bulge <= RESOLUTION * limits if len(piece) <= MAX_OPEN_PIECES else np.ones_like(undecided)
+        exceeds = low_exceeds | high_exceeds
+        unproved = (undecided & resolved).any(axis=1)
+        wrong = np.flatnonzero(exceeds | unproved)
+        places.append(piece[wrong] + np.where(exceeds & ~low_exceeds, high, low)[wrong])
+        beyond.append((np.where(bound > allowed, bound, bound + unsure) - allowed)[wrong])
+        # halve undecided intervals, and intervals with an excess at one end only, to locate the excess
+        unlocated = exceeds & (low_exceeds != high_exceeds) & (high - low > PLACE_RESOLUTION)
+        halved = undecided.any(axis=1) & (unlocated | ~(exceeds | unproved))
+        piece = piece[halved]
+        low = low[halved]
+        high = high[halved]
+        middle = (low + high) / 2
+        at_middle = magnitudes(piece, middle)
+        at_low = at_low[halved]
+        at_high = at_high[halved]
+        at_low = np.concatenate([at_low, at_middle])
+        at_high = np.concatenate([at_middle, at_high])
+        low = np.append(low, middle)
+        high = np.append(middle, high)
+        piece = np.tile(piece, 2)
+    place = np.concatenate(places)
+    excess = np.concatenate(beyond)
+    if not len(place):
+        return None
+    i = int(place.argmin())
+    j = int(excess[i].argmax())
+    return Excess(float(place[i]), j, float(excess[i, j] + allowed[j]), float(excess[:, j].max()))
+
+
 CHORD_SHARE = 0.1
 """Collision is checked on straight lines, and certified clearances are reduced by how far the cubics leave
 these lines. Rows are added until the reduction is at most this fraction of the clearance."""
@@ -202,10 +346,7 @@ class Verifier:
 
     def _check_shape(self, what: str, motion: Path | Trajectory) -> None:
         shape = motion.positions.shape
-        if tuple(motion.joint_names) != self.robot.joint_names:
-            names = joined(motion.joint_names)
-            right = joined(self.robot.joint_names)
-            raise InputError(f"{what}.joint_names is {names}; the robot's planned joints are {right}")
+        check_joints(what, motion.joint_names, self.robot)
         if len(shape) != 2 or shape[1] != self.robot.dof or shape[0] == 0:
             raise InputError(
                 f"{what}.positions has shape {shape}; it must be n x {self.robot.dof} with n >= 1"
@@ -234,7 +375,10 @@ class Verifier:
         bad = np.flatnonzero(~(np.abs(q) <= MAX_COORDINATE).all(axis=1))
         if len(bad):
             at = float(bad[0] if times is None else times[bad[0]])
-            message = f"waypoint {bad[0]} holds values that are not finite, or not within ±{MAX_COORDINATE:g}"
+            row = q[bad[0]]
+            j = int((~(np.abs(row) <= MAX_COORDINATE)).argmax())
+            rule = f"it must be a finite number within ±{MAX_COORDINATE:g}"
+            message = f"{self.robot.joint_names[j]} is {row[j]:g} at waypoint {bad[0]}; {rule}"
             return Report(False, Violation("not_finite", at, message), None, None)
         clock = np.arange(len(q), dtype=float) if times is None else times
         limits = self._limits(q, clock, "waypoint {:g}" if times is None else "{:.3f} s")
@@ -350,8 +494,7 @@ class Verifier:
             return None
         at = _time_at(beyond.place, trajectory.times)
         constraint = self.constraints.speed_limited[beyond.column]
-        speed_limit = limits[beyond.column]
-        speed, limit = distinct(beyond.value, speed_limit, digits=4)
+        speed, limit = distinct(beyond.value, limits[beyond.column], digits=4)
         message = f"{constraint.frame} moves at {speed} m/s; {constraint.kind} allows {limit} m/s"
         return Violation("speed", at, message, constraint.frame, constraint.kind, beyond.excess)
 
@@ -446,15 +589,15 @@ class Verifier:
 
 @kernel()
 def _spaced_rows(q, step):
-    """Indices of rows of q [n, dof]: row 0, then each row that is at least `step` from the last returned
-    row."""
+    """Indices of rows of q [n, dof]: row 0, then each row that is at least `step` from the last returned row
+    and differs from it."""
     row_indices = np.zeros(len(q), np.int64)
     count = 1
     for i in range(1, len(q)):
         total = 0.0
         for j in range(q.shape[1]):
             total += (q[i, j] - q[row_indices[count - 1], j]) ** 2
-        if total >= step * step:
+        if total > 0.0 and total >= step * step:
             row_indices[count] = i
             count += 1
     return row_indices[:count]
@@ -508,16 +651,16 @@ def collision_violation(contact: Contact, time: float) -> Violation:
 def violations(
     problem: Problem, motion: Path | Trajectory, settings: VerifySettings = DEFAULT
 ) -> tuple[Violation, ...]:
-    """All violations of a motion in the order of their places; empty if it is valid.
+    """The violations of a motion in the order of their places; empty if it is valid.
 
-    They include every contact with static obstacles and between links, at the place where it begins (only the
-    deepest if a link touches several obstacles at once); joint limits once for each joint; and the first
-    violation of every other kind, also the first contact with a moving obstacle. If numbers are not finite,
-    or times are not those of a motion, only this is returned.
+    Every contact with static obstacles and between links is listed, at the place where it begins; if a link
+    touches several obstacles at once, only the deepest contact. Joint limits are listed once for each joint.
+    Of every other kind, contacts with moving obstacles included, only the first violation is listed; but a
+    step by nearly a whole turn may be listed twice, as a wrapped value and for its mean velocity. Contacts
+    with moving obstacles are searched only up to the first violation that is no contact. Torques and frame
+    speeds of a trajectory are checked only if the rates are right. If numbers are not finite, or times are
+    not those of a motion, only this is returned.
     """
-    from robotdiffuse.collision.motions import contacts  # imported here, since nothing else needs it
-
-    timed = isinstance(motion, Trajectory)
     report = verify(problem, motion, settings)
     if report.valid or (report.violation is not None and report.violation.kind in ("not_finite", "time")):
         return () if report.violation is None else (report.violation,)
@@ -528,13 +671,20 @@ def violations(
     ]
     q = motion.positions
     clock = np.arange(len(motion.positions), dtype=float)
-    if timed:
+    cubics = None
+    if isinstance(motion, Trajectory):
+        cubics = Cubics(motion)
         rates = any(wrong.kind in RATE_KINDS for wrong in all_violations)
-        clock, q = (motion.times, q) if rates else Cubics(motion).sampled(settings.chord)[:2]
+        clock, q = (motion.times, q) if rates else cubics.sampled(settings.chord)[:2]
     for contact in contacts(problem.robot, problem.scene, q, settings.contact):
         all_violations.append(collision_violation(contact, _time_at(contact.at, clock)))
-    if timed:
-        times, turns = Cubics(motion).turns()
+    # `verify` may use a finer chord, and so find a contact that the search along these lines misses
+    listed = {(w.kind, w.subject, w.other) for w in all_violations}
+    all_violations += [
+        w for w in report.found if w.kind in CONTACT_KINDS and (w.kind, w.subject, w.other) not in listed
+    ]
+    if cubics is not None:
+        times, turns = cubics.turns()
         clock = np.concatenate([clock, times])
         q = np.concatenate([q, turns])
     all_violations += _limit_violations(problem, q, clock, settings)

@@ -4,10 +4,10 @@ motions at once; see `lane_collision.py`.
 A short motion is given by its middle configuration and dq, half of the joint motion from its start to its
 end. The parameter t goes from -1 (start) over 0 (middle) to 1 (end). At t, the center of a sphere has moved
 by t v + r from its position in the middle. v is the Jacobian times dq, and `motion_certificate.py` computes a
-bound on the remainder |r| for the whole link. The distance to a convex obstacle is a convex function of the
-position, so along t v it is nowhere below its tangent in the middle. With d the distance and n the direction
-to the obstacle's nearest point, both in the middle, the sphere stays at least d - |n . v| - |r| away. A
-configuration is a motion with v = 0.
+bound on the remainder |r| for the whole link. Let d be the distance to a convex obstacle in the middle, and n
+the direction to its nearest point there. The distance is a convex function of the position, so it is nowhere
+below its tangent at the middle: the sphere stays at least d - |n . v| - |r| away. A configuration is a motion
+with v = 0.
 """
 
 from typing import NamedTuple
@@ -53,8 +53,8 @@ class ClearanceWorkspace(NamedTuple):
     frames: np.ndarray
     """[dof + 1, 12 * W] in the middle of each motion."""
     twists: np.ndarray
-    """[dof + 1, 6 * W] for each frame the angular velocity, and the velocity of the point of the frame that
-    is at the base's origin, per unit of t."""
+    """[dof + 1, 6 * W] motion of each frame per unit of t: its angular velocity, and the velocity that a
+    point fixed to the frame has at the base's origin."""
     centers: np.ndarray
     """[groups, 3 * W] centers of the bounding spheres."""
     positions: np.ndarray
@@ -99,9 +99,9 @@ def make_clearance_workspace(robot, solids):
 
 @allocation_free(forceinline=True)
 def to_solid(points, velocities, solid):
-    """Signed distances of the points in 16 lanes to a row of `SceneArrays.solids`, and the components of the
-    points' velocities along the lines to the solid's nearest points, as absolute values. The components are 0
-    inside the box or cylinder that the solid's ball rounds."""
+    """Signed distances of the points in 16 lanes to a row of `SceneArrays.solids`, and how fast the points
+    move towards or away from the nearest points of the solid. This speed is 0 for points inside the box or
+    cylinder that the ball of the solid widens."""
     u, v, w = in_axes(solid, minus(points, solid))
     # velocity in the solid's axes; multiplied by the sign of the coordinate, it is the speed away from the
     # center
@@ -197,9 +197,10 @@ def _mark_near(robot, scene, g, speed, work):
     upper_bound = load(work.need, 0, 0)
     solids = len(scene.solids)
     for k in range(solids):
+        # without a velocity
         distance, _ = to_solid(centers, minus(centers, centers), scene.solids[k])
         if len(scene.may_touch) and scene.may_touch[g, k]:
-            distance = distance * _ZERO + _FAR
+            distance = distance * _ZERO + _FAR  # _FAR in all lanes
         store(work.bounds, k, 0, distance)
         upper_bound = minimum(upper_bound, distance + radius)
     obstacles = solids
@@ -211,6 +212,7 @@ def _mark_near(robot, scene, g, speed, work):
             )
     any_near = False
     for k in range(obstacles):
+        # a comparison gives a mask of the lanes, which is 0 if it holds in none
         work.near[k] = (load(work.bounds, k, 0) - radius - speed < upper_bound) != 0
         any_near |= work.near[k]
     return any_near
@@ -250,7 +252,7 @@ def group_along(robot, scene, g, swept, work):
 
 @allocation_free(forceinline=True)
 def pair_along(robot, p, swept, work):
-    """Like `group_along`, for the clearance between the links of a checked pair."""
+    """Does what `group_along` does, for the clearance between the links of a checked pair."""
     a = robot.pairs[p, 0]
     b = robot.pairs[p, 1]
     spheres = robot.spheres

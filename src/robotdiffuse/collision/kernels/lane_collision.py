@@ -69,7 +69,8 @@ def _sine_of_turn(u):
 @allocation_free(forceinline=True)
 def _move(frames, parent, j, offset, q):
     """Writes the frame that joint j moves, in 16 lanes: frames[j + 1] = frames[parent] @ offset @ M(q), where
-    M rotates about z, or translates along z for a prismatic joint."""
+    M rotates about z, or translates along z for a prismatic joint. offset: rotation, translation, and 1 for a
+    prismatic joint."""
     value = load(q, j, 0)
     slide = value * offset[12]
     if offset[12] > _ZERO:
@@ -128,7 +129,7 @@ class Workspace(NamedTuple):
 
 
 @kernel()
-def make_workspace(robot, scene):
+def make_workspace(robot):
     """Scratch memory for one thread."""
     frames = lanes_array(len(robot.offsets) + 1, 12)
     for k in (0, 4, 8):
@@ -138,7 +139,9 @@ def make_workspace(robot, scene):
 
 @allocation_free(forceinline=True)
 def _touching(centers, radius, solid):
-    """Mask of the lanes with a sphere that touches an obstacle, a row of `SceneArrays.solids`."""
+    """Mask of the lanes with a sphere that touches an obstacle, a row of `SceneArrays.solids`. Entries 12 to
+    14 of the row are the half edges (of a cylinder: the radius twice, and the half height), entry 15 is the
+    radius that is added, and entry 16 is 1 for a cylinder."""
     u, v, w = in_axes(solid, minus(centers, solid))
     w = maximum(absolute(w) - solid[14], _ZERO)
     reach = radius + solid[15]
@@ -262,7 +265,7 @@ def _hits_scene(robot, scene, padding, stop_at_first, work):
     hits = 0
     frames = work.frames
     for g in range(len(robot.frame)):
-        if robot.frame[g] == 0:
+        if robot.frame[g] == 0:  # links that no joint moves
             continue
         # the box from `low` to `high` is around the 16 centers of the group's bounding sphere
         centers = load_vector(work.centers, g, 0)
@@ -349,10 +352,10 @@ def take_block(q, start, block):
 
 @kernel(nogil=True)
 def free_many(robot, scene, q, padding):
-    """Whether each row of q[n, dof] is free of collision."""
+    """Whether each row of q[n, dof] is free of collision; `padding` as in `block_hits`."""
     n = len(q)
     out = np.empty(n, np.bool_)
-    work = make_workspace(robot, scene)
+    work = make_workspace(robot)
     block = np.empty((q.shape[1], W), np.float32)
     for start in range(0, n, W):
         take_block(q, start, block)

@@ -53,7 +53,7 @@ class Scratch(NamedTuple):
 def make_scratch(space, q):
     """Scratch memory for one thread, with configurations of the data type of q."""
     dof = len(space.lower)
-    work = make_workspace(space.robot, space.scene)
+    work = make_workspace(space.robot)
     return Scratch(work, np.empty((dof, W), np.float32), np.empty(dof, q.dtype), np.empty(dof, q.dtype))
 
 

@@ -4,8 +4,8 @@ A task is an interval of a timed motion, with the pairs of a link and an obstacl
 The clearance of a pair in the middle of the interval is computed from the covering spheres. The distances
 that points of the link and of the obstacle can move from the middle to either end are subtracted. The pair
 is settled if the result is at least the required clearance; otherwise the interval is halved. A pair is left
-to the exact meshes if its clearance in the middle is no larger than the required one, or if the interval has
-been halved MAX_HALVINGS times.
+to the exact meshes if its clearance in the middle is at most `least` (see `settle_tasks`), or if the interval
+has been halved MAX_HALVINGS times.
 """
 
 from typing import NamedTuple
@@ -197,7 +197,7 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
     stops = np.empty(MAX_HALVINGS + 2)
     depths = np.empty(MAX_HALVINGS + 2, np.int64)
     pairs = np.empty((MAX_HALVINGS + 2, count, obstacles), np.bool_)
-    remaining = [(0.0, 0.0, 0, 0, 0.0) for _ in range(0)]
+    remaining = [(0.0, 0.0, 0, 0, 0.0) for _ in range(0)]  # empty; tells Numba the type of the entries
     certified = CLEARANCE_CAP
     for task in range(len(tasks.start)):
         starts[0] = tasks.start[task]
@@ -238,6 +238,7 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
                     inflation = tracks.growth[o] * max(time, 0.0)
                     clearance_loss = travel[link] + obstacle_travel + tracks.growth[o] * half_duration
                     required = max(least, tightness * best[0])
+                    # above it, a lower bound is enough: it settles the pair and does not lower best[0]
                     cutoff = inflation + clearance_loss + max(required, best[0] if tightness > 0 else 0.0)
                     clearance = (
                         _clearance(links, frames, link, tracks, o, rotation, box_center, cutoff) - inflation

@@ -50,8 +50,8 @@ def make_grid(points, starts, run, low, voxel, shape, band, known):
     """For every voxel center the distance to the nearest point's center [m], and the index of that point.
 
     Both are exact below `band` [m]. Beyond the band, the distance is a lower bound, and the index is that of
-    a nearby point, or -1 if no point is within `known` [m]. `low` is the grid's lower corner
-    [m], `voxel` the edge of a voxel [m]. run[nx * ny * nz] has the value b for the voxel that contains the
+    a nearby point, or -1 where this bound is at least `known` [m]. `low` is the grid's lower corner [m],
+    `voxel` the edge of a voxel [m]. run[nx * ny * nz] has the value b for the voxel that contains the
     points starts[b] to starts[b + 1], exclusive, and -1 for voxels without points.
     """
     nx, ny, nz = shape
