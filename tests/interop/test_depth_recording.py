@@ -183,11 +183,12 @@ def test_damaged_bags_are_refused(size: int, tmp_path: Path) -> None:
 
 
 def test_joint_states_near_in_time_count(tmp_path: Path) -> None:
-    """Regression: a joint state far away in time was used, and one without positions was reported as damage."""
+    """Regression: one far away in time was used, one without positions was damage; log times of transforms did not count."""
     rates = {"header": {"stamp": stamp(1.05)}, "name": list(PANDA.joint_names), "velocity": [0.0] * 7}
     changes: tuple[tuple[Callable[[dict[str, Any]], object], float], ...] = (
         (lambda messages: messages["/joint_states"][1]["header"]["stamp"].update(sec=100), 1.0),
         (lambda messages: messages["/joint_states"].append(rates), 1.05),
+        (lambda of: [m["header"].update(stamp=stamp(0)) for m in (*of["/camera/image_rect"], *of["/tf"][0]["transforms"])], 1),
     )
     for change, at in changes:
         [(_, view)] = rd.read_depth_views(recording(tmp_path / "r.mcap", change), PANDA)
@@ -226,10 +227,8 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
         (lambda of: of["/camera/camera_info"].clear(), "no CameraInfo in the folder /camera"),
         (lambda of: of["/camera/image_rect"].clear(), "holds no depth images"),
         (lambda of: of["/tf"].clear(), "no transforms connect camera_optical.*with panda_link0.*panda_hand"),
-        (
-            lambda of: [state["header"]["stamp"].update(sec=3) for state in of["/joint_states"]],
-            "no joint state of panda_joint1.* within 0.1 s of the image",
-        ),
+        (lambda of: [s["header"].update(stamp=stamp(3)) for s in of["/joint_states"]], "no joint state of panda.*0.1 s of the"),
+        (lambda of: of["/camera/image_rect"][0].update(encoding="32FC1"), "is damaged: .*cannot reshape"),
         (lambda of: of["/camera/image_rect"][0].update(encoding="rgb8"), "holds no depth images"),
         (lambda of: of["/camera/camera_info"][0].update(width=3), "2 x 2 pixels; their CameraInfo has 3 x 2"),
     )
@@ -243,8 +242,9 @@ def test_other_files_and_topics_are_refused(tmp_path: Path) -> None:
     other = rd.read_depth_views(recording(tmp_path / "r.mcap"), PANDA, ["/other"])
     refuses("'/other' holds no images; topics of images: /camera/image_rect", list, other)
     views = {"wrist": [depth_recording.StampedView(0.0, rd.DepthView(np.ones((2, 2)), (300, 300, 0.5, 0.5), np.eye(4)))]}
-    written = depth_recording.write_depth_views, PANDA, views, tmp_path / "w.mcap"
-    refuses("the view of wrist at 0 s has no configuration", *written)
+    refuses(
+        "the view of wrist at 0 s has no configuration", depth_recording.write_depth_views, PANDA, views, tmp_path / "w.mcap"
+    )
     read = unwrap(rd.read_depth_views)
     refuses("topics is '/cam/depth'; it must be a list of names", list, read(tmp_path / "a.mcap", PANDA, "/cam/depth"))
     refuses("robot is 'panda'; it must be a Robot", list, read(tmp_path / "a.mcap", "panda"))

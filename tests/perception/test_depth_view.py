@@ -44,9 +44,7 @@ def test_a_cloud_becomes_the_image_that_its_camera_had() -> None:
     view = rd.DepthView.from_cloud(points, T)
     h, w = view.depth.shape
     assert np.array_equal(view.points(), points) and h * w <= 320 * 240
-    upper = view.depth[2 : h // 2 - 2, 2:-2]
-    lower = view.depth[h // 2 + 2 : -2, 2:-2]
-    for half, z in ((upper, 1.0), (lower, 2.0)):
+    for half, z in ((view.depth[2 : h // 2 - 2, 2:-2], 1.0), (view.depth[h // 2 + 2 : -2, 2:-2], 2.0)):
         assert np.mean(half > 0) > 0.6 and np.allclose(half[half > 0], z, atol=1e-5)
     refuses("none of 10 is in front", rd.DepthView.from_cloud, T[:3, 3] - T[:3, 2] + np.zeros((10, 3)), T)
     for wrong in (np.zeros((3, 2)), np.ones((2, 3)) + 1j, [[0, 0, np.nan]], "abc", []):
@@ -63,7 +61,7 @@ def test_what_is_refused() -> None:
         ({"T_base_camera": 2 * np.eye(4)}, "the determinant 8 .* it must be a homogeneous transform"),
         ({"T_base_camera": np.diag([1.0, -1.0, 1.0, 1.0])}, "the determinant -1 and the last row"),
         ({"T_base_camera": T.T}, r"the last row \[1\."),
-        ({"configuration": [np.nan]}, "view.configuration"),
+        ({"configuration": [[0.5]]}, "view.configuration is .*; it must be n finite numbers"),
         ({"range": "far"}, "view.range is 'far'; it must be a number"),
         ({"noise": 0.01}, "noise is 0.01; it must be what rd.measure_noise returns"),
         ({"pose_deviation": (0.0, 1.0)}, "view.pose_deviation is .* angle up to 0.5"),
@@ -106,8 +104,8 @@ def test_depth_files(tmp_path: Path) -> None:
 
 
 def test_depths_that_files_write_for_infinity_are_infinite() -> None:
-    view = rd.DepthView([[1.0, np.inf]], K, T)
-    assert rd.DepthView(view_entry(view, None)["depth"], K, T).depth.tolist() == [[1.0, np.inf]]
+    view = rd.DepthView([[1.0, np.inf]], K, T, range=np.float32(4.0))  # type: ignore[arg-type]
+    assert rd.DepthView(view_entry(view, None)["depth"], K, T).depth.tolist() == [[1.0, np.inf]] and type(view.range) is float
 
 
 def test_openexr_depth(tmp_path: Path) -> None:
@@ -152,7 +150,7 @@ def test_views_survive_their_files(tmp_path: Path) -> None:
         ("a.npy", MATRIX),
     ],
 )
-def test_intrinsics_beside_an_image(name: str, content: Any, tmp_path: Path) -> None:
+def test_intrinsics_beside_an_image(name: str, content: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Image.fromarray(np.full((6, 8), 1500, np.uint16)).save(tmp_path / "a.png")
     if name.endswith("npy"):
         np.save(tmp_path / name, content)
@@ -161,8 +159,9 @@ def test_intrinsics_beside_an_image(name: str, content: Any, tmp_path: Path) -> 
     entry: dict[str, Any] = {"depth": "a.png", "camera": CAMERA}
     if name.startswith("camera"):
         entry["intrinsics"] = name
-    [view], _ = read_views([entry], tmp_path)
-    assert view.intrinsics == K
+    monkeypatch.chdir(tmp_path.parent)
+    for folder in (tmp_path, Path(tmp_path.name)):
+        assert read_views([entry], folder)[0][0].intrinsics == K
 
 
 @pytest.mark.parametrize(
@@ -175,14 +174,18 @@ def test_intrinsics_in_a_file_for_images_of_another_size(stated: dict[str, int],
     entry = {"depth": "a.png", "intrinsics": "camera.json", "camera": CAMERA}
     (tmp_path / "camera.json").write_text(json.dumps(content | stated))
     refuses(r"camera.json is for images of .* pixels, h x w; this one has \(6, 8\)", read_views, [entry], tmp_path)
-    (tmp_path / "camera.json").write_text(json.dumps(content | {"width": 8, "height": 6}))
-    assert read_views([entry], tmp_path)[0][0].intrinsics == K
+    (tmp_path / "camera.json").write_text(json.dumps(content | {"width": 8, "height": 6, "coeffs": [0.1, 0, 0, 0, 0]}))
+    (view,), notes = read_views([entry], tmp_path)
+    assert view.intrinsics == K and notes[0].endswith(
+        "camera.json: the distortion coeffs is ignored; the image must be rectified"
+    )
 
 
 def test_what_is_wrong_in_a_file(tmp_path: Path) -> None:
     for name in "abc":
         Image.fromarray(np.full((6, 8), 1500, np.uint16)).save(tmp_path / f"{name}.png")
     (tmp_path / "b.json").write_text('{"K": [1.0, 2.0]}')
+    (tmp_path / "d.json").write_text('{"K": {"rows": 3}}')
     (tmp_path / "c.json").write_text('{"fx": "wide", "fy": 1.0, "cx": 1.0, "cy": 1.0}')
     np.save(tmp_path / "image.npy", np.ones((6, 8)))
     for entry, message in (
@@ -195,6 +198,7 @@ def test_what_is_wrong_in_a_file(tmp_path: Path) -> None:
         ({"depth": "c.png", "camera": CAMERA}, "view.intrinsics is"),
         ({"depth": "a.png", "camera": CAMERA, "intrinsics": "K.mat"}, "unknown intrinsics format of .*K.mat: '.mat'"),
         ({"depth": "a.png", "camera": CAMERA, "intrinsics": "image.npy"}, "image.npy holds no intrinsics"),
+        ({"depth": "a.png", "camera": CAMERA, "intrinsics": "d.json"}, "d.json holds no intrinsics"),
     ):
         refuses(message, read_views, [entry], tmp_path)
 
@@ -219,3 +223,18 @@ def test_small_images_cannot_fill_the_memory(tmp_path: Path) -> None:
         endings.append("exr")
     for ending in endings:
         refuses("16,781,312 pixels; it must have at most 16,777,216", read_depth, tmp_path / f"huge.{ending}")
+
+
+def test_moved_clouds_and_noisy_images_are_saved_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regressions: the name of the file was written, also relative to another working folder."""
+    monkeypatch.chdir(tmp_path)
+    np.save("c.npy", [[0.5, 0.0, 0.2], [0.6, 0.1, 0.3]])
+    np.save("d.npy", np.ones((8, 8)))
+    entries = [{"cloud": "c.npy", "camera": CAMERA}, {"depth": "d.npy", "intrinsics": [9, 9, 4, 4], "camera": CAMERA}]
+    (cloud, image), _ = read_views(entries, Path())
+    moved = cloud.moved(transform(np.array([0.0, 0.0, 1.0])))
+    assert view_entry(moved, tmp_path)["cloud"] == moved.points().tolist()
+    noisy = DepthNoise(spread=0.05).applied(image, np.random.default_rng(0))
+    assert view_entry(noisy, tmp_path)["depth"] == noisy.depth.tolist()
+    monkeypatch.chdir(Path(__file__).parent)
+    assert view_entry(image, tmp_path)["depth"] == "d.npy"

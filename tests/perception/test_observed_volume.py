@@ -169,3 +169,12 @@ def test_minima_of_squares_in_images_narrower_than_the_squares(shape: tuple[int,
 def test_no_views_and_another_robots_configuration_are_refused() -> None:
     refuses("views is empty", observe, [], PANDA, HOME)
     refuses("has 3 numbers; panda plans 7", observe, [view(flat(1.0), q=np.zeros(3))], PANDA, HOME)
+
+
+def test_a_return_too_near_to_count_does_not_undo_empty_space() -> None:
+    image = np.where(np.arange(64) < 40, np.full((48, 64), 1.6), 0.0)
+    counts = set()
+    for image[10, 10] in (0.0, 1e-3, 1e-30):
+        view = rd.DepthView(image, (50, 50, 31.5, 23.5), rd.pose([0, -1, 0.5], rpy=[-np.pi / 2, 0, 0]), range=1.8)
+        counts.add(int(observe([view], PANDA, HOME).free.sum()))
+    assert len(counts) == 1

@@ -33,8 +33,7 @@ def test_points_lie_on_surfaces_and_nothing_is_nearer(seed: int) -> None:
     position *= rng.uniform(1.3, 2.2) / np.linalg.norm(position)
     T = looking_at(position, rng.uniform(-0.3, 0.3, 3), rng.uniform(-3, 3))
     view = ray_cast(scene, T, INTRINSICS, SIZE)
-    points = view.points()
-    nearest = np.min([distance(shape, points) for shape in scene.shapes], axis=0)
+    nearest = np.min([distance(shape, view.points()) for shape in scene.shapes], axis=0)
     assert np.abs(nearest).max(initial=0) < 5e-5, "float32, at 2 m"
     # along each ray, up to the surface or to the end, everything is outside of all shapes
     v, u = np.mgrid[: SIZE[1], : SIZE[0]]
@@ -83,8 +82,7 @@ def test_pybullets_camera_sees_the_same(tmp_path: Path) -> None:
             pybullet.createMultiBody(0.0, -1, visual, shape.center.tolist(), [*xyz, w])
         placed = pybullet.computeViewMatrix(eye, target, (0, 0, 1))
         lens = pybullet.computeProjectionMatrixFOV(np.degrees(field), width / height, near, far)
-        tiny = pybullet.ER_TINY_RENDERER
-        *_, depth, bodies = pybullet.getCameraImage(width, height, placed, lens, shadow=0, renderer=tiny)
+        *_, depth, bodies = pybullet.getCameraImage(width, height, placed, lens, shadow=0, renderer=pybullet.ER_TINY_RENDERER)
     finally:
         pybullet.disconnect(client)
     found = np.reshape(bodies, (height, width)) >= 0

@@ -7,9 +7,9 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.collision.kernel_arrays import compile_robot
-from robotdiffuse.perception import unknown_space
+from robotdiffuse.perception import occupancy_map
 from robotdiffuse.perception.observed_volume import ObservedVolume
-from robotdiffuse.perception.unknown_space import EXPLORED, ONE_VIEW, CrossedSpace, UnknownSpace, probability_free
+from robotdiffuse.perception.occupancy_map import EXPLORED, ONE_VIEW, CrossedSpace, UnknownSpace, probability_free
 from robotdiffuse.perception.voxel_grid import FINE, FINE_SHAPE, LOW, SHAPE, VOXEL, heaviest_part, surface, sweep
 
 PANDA = rd.load_robot("panda")
@@ -27,22 +27,21 @@ def test_the_probability_that_a_motion_is_free_falls_with_its_risk(curve: tuple[
 
 
 def test_confidence_follows_from_the_risk_or_is_the_rate_of_the_assumption() -> None:
-    likely = np.full(FINE_SHAPE, 0.01, np.float32)
-    stated = unknown_space.confidence("predicted, p > 0.1", CrossedSpace(VOXELS, likely))
+    stated = occupancy_map.confidence("predicted, p > 0.1", CrossedSpace(VOXELS, np.full(FINE_SHAPE, 0.01, np.float32)))
     assert np.isclose(stated, probability_free(0.01 * VOXELS.sum(), ONE_VIEW), rtol=1e-4)
-    for name, rate in unknown_space.RATES.items():
-        assert unknown_space.confidence(name, CrossedSpace(VOXELS, None)) == rate
-        assert unknown_space.confidence(name, CrossedSpace(VOXELS, None, lost_share=0.5)) == rate / 2
+    for name, rate in occupancy_map.RATES.items():
+        assert occupancy_map.confidence(name, CrossedSpace(VOXELS, None)) == rate
+        assert occupancy_map.confidence(name, CrossedSpace(VOXELS, None, lost_share=0.5)) == rate / 2
 
 
 def test_only_wide_regions_without_a_return_lower_the_confidence() -> None:
     lost = np.zeros(SHAPE, np.bool_)
     volume = ObservedVolume(lost, lost, lost, lost, np.zeros(SHAPE, np.float32), lost)
-    assert not unknown_space.lost_regions(volume).any()
+    assert not occupancy_map.lost_regions(volume).any()
     lost[10:12, 10:30, 10:30] = True
-    assert not unknown_space.lost_regions(volume).any()
+    assert not occupancy_map.lost_regions(volume).any()
     lost[30:34, 20:23, 4:9] = True
-    assert unknown_space.lost_regions(volume).sum() == 8 * 4 * 3 * 5
+    assert occupancy_map.lost_regions(volume).sum() == 8 * 4 * 3 * 5
 
 
 def test_only_what_the_arm_fills_at_the_ends_is_left_out_without_a_margin() -> None:
@@ -71,7 +70,7 @@ def test_swept_voxels_are_those_in_the_spheres_along_the_way() -> None:
         assert within.sum() > 20 and swept[tuple(some[within].T)].all()
 
 
-def test_the_part_that_weighs_most_is_boxed() -> None:
+def test_the_part_that_weighs_most_is_boxed_and_the_surface_is_what_has_a_face_outside() -> None:
     marked = np.zeros((6, 7, 8), np.bool_)
     weights = np.ones((6, 7, 8), np.float32)
     marked[0, 0, :3] = True
@@ -81,9 +80,6 @@ def test_the_part_that_weighs_most_is_boxed() -> None:
     weights[5, 6, 7] = 4.0
     assert heaviest_part(marked, weights).tolist() == [[5, 6, 7], [6, 7, 8]]
     assert not heaviest_part(np.zeros_like(marked), weights).any()
-
-
-def test_the_surface_is_what_has_a_face_outside() -> None:
     marked = np.zeros((5, 5, 5), np.bool_)
     marked[1:4, 1:4, 1:4] = True
     assert len(surface(marked)) == 26 and [2, 2, 2] not in surface(marked).tolist()

@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robotdiffuse.core.errors import InputError, check_type
-from robotdiffuse.core.input_files import file_name
-from robotdiffuse.core.output_files import check_output
+from robotdiffuse.core.files import check_output, file_name
 from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.core.types import Trajectory
 
@@ -50,8 +49,8 @@ TRAJECTORY_ENDINGS = (".json", ".csv")
 
 
 def check_export(file: str | Path, *inputs: str) -> Path:
-    """The file as a path, after checking that its format is known, that the package of the format is
-    installed, and that the file can be written. The last check is left out for an existing bag folder.
+    """The file as a path. Its format must be known, the package of the format installed, and the file
+    writable; whether an existing bag folder is writable is not checked.
 
     Raises InputError for an ending that is not in WRITERS or TRAJECTORY_ENDINGS, for a package that is not
     installed, for a folder that is missing or read-only, and if the file is one of `inputs`.
@@ -69,12 +68,13 @@ def write_motion(problem: "Problem", trajectory: Trajectory, file: str | Path) -
     """Write a motion and its problem in the format of the file's ending, one of WRITERS or
     TRAJECTORY_ENDINGS.
 
-    Raises InputError as `check_export` does.
+    Raises InputError for arguments of another type, for rows less than 1 ns apart in the formats of ROS, and
+    as `check_export` does.
     """
     from robotdiffuse.problems.problem import check_problem
 
     check_problem(problem)
-    check_type("trajectory", trajectory, Trajectory, "a Trajectory, such as the field of rd.plan's result")
+    check_type("trajectory", trajectory, Trajectory, "a Trajectory, such as rd.plan(problem).trajectory")
     path = check_export(file)
     if path.suffix.lower() in TRAJECTORY_ENDINGS:
         trajectory.save(path)
@@ -85,8 +85,8 @@ def write_motion(problem: "Problem", trajectory: Trajectory, file: str | Path) -
 def read_motion(file: str | Path, topic: str | None = None) -> "RecordedMotion":
     """Read a motion from a file of any program; a folder is read as a ROS 2 bag.
 
-    Raises InputError for an ending that is not in READERS, a file that is damaged or holds no motion, and a
-    package that is not installed.
+    Raises InputError for an ending that is not in READERS, a file that is missing, damaged or holds no motion
+    or several, a topic that holds no motion, and a package that is not installed.
     """
     path = file_name(file)
     ending = BAG if path.is_dir() else path.suffix.lower()

@@ -22,8 +22,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
 from robotdiffuse.core.errors import InputError, check_list, reading, unit_quaternion
-from robotdiffuse.core.input_files import file_name
-from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.files import JsonObject, file_name, write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 from robotdiffuse.core.types import Configuration, JointValues, Pose
 from robotdiffuse.interop.recorded_motion import time_message
@@ -45,7 +44,7 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 ENCODINGS = {"32FC1": ("f4", 1.0), "16UC1": ("u2", 0.001), "mono16": ("u2", 0.001)}
 """For each encoding of depth images, the type of the pixels and the meters per unit (REP 118)."""
 MAX_SIZE = 64 * 10**9
-"""Largest size of a recording [bytes]."""
+"""Largest size of an .mcap file [bytes]; bags may be larger."""
 MAX_GAP = 0.1
 """Joint states and transforms are interpolated between two messages that are at most this far from the image
 in time [s]."""
@@ -88,7 +87,7 @@ def write_depth_views(robot: Robot, views: Mapping[str, Sequence[StampedView]], 
     write_atomically(Path(file), stream.getvalue())
 
 
-def _transform(parent: str, child: str, stamp: dict[str, int], T: Pose) -> dict[str, Any]:
+def _transform(parent: str, child: str, stamp: dict[str, int], T: Pose) -> JsonObject:
     w, x, y, z = quaternion_from_rotation(T[:3, :3]).tolist()
     place = dict(zip("xyz", T[:3, 3].tolist(), strict=True))
     return {
@@ -98,7 +97,7 @@ def _transform(parent: str, child: str, stamp: dict[str, int], T: Pose) -> dict[
     }
 
 
-def _camera_info(header: dict[str, Any], view: DepthView) -> dict[str, Any]:
+def _camera_info(header: JsonObject, view: DepthView) -> JsonObject:
     fx, fy, cx, cy = view.intrinsics
     return {
         "header": header,
@@ -112,7 +111,7 @@ def _camera_info(header: dict[str, Any], view: DepthView) -> dict[str, Any]:
     }
 
 
-def _image(header: dict[str, Any], view: DepthView) -> dict[str, Any]:
+def _image(header: JsonObject, view: DepthView) -> JsonObject:
     height, width = view.depth.shape
     return {
         "header": header,
@@ -150,7 +149,7 @@ def read_depth_views(
         An iterator over the views, each with the stamp of its image [s].
 
     Raises:
-        InputError: For a file that is damaged or holds no uncompressed depth images, for a topic without
+        InputError: For a file that cannot be read or holds no uncompressed depth images, for a topic without
             images or with another encoding, if no image has joint states and transforms within 0.1 s, for an
             image without CameraInfo of its size, and for distorted images.
 
@@ -163,7 +162,7 @@ def read_depth_views(
     path = file_name(file)
     check_robot(robot)
     if topics is not None:
-        check_list("topics", topics, str, "names of topics")
+        check_list("topics", topics, str, "names of topics", least=1)
     if path.suffix == ".db3":
         raise InputError(f"{path} is a part of a ROS 2 bag: give the folder with it and its metadata.yaml")
     with reading(file), opened_recording(path, MAX_SIZE) as recording:
@@ -182,7 +181,7 @@ def _read(
     images = _image_topics(kinds, topics)
     states = _States(robot)
     transforms = TransformHistory()
-    infos: dict[str, dict[str, Any]] = {}
+    infos: dict[str, JsonObject] = {}
     units: dict[str, float] = {}
     has_states = JOINT_STATE in kinds.values()
     # topics with the meters per unit of a sensor's depth images, in bags of librealsense
@@ -196,7 +195,7 @@ def _read(
             states.add(_seconds(message, at), to_plain(message))
         elif kind == TRANSFORMS:
             for stamped in message.transforms:
-                transforms.add(to_plain(stamped), static=topic.endswith("static"))
+                transforms.add(to_plain(stamped), topic.endswith("static"), at)
         else:
             units[topic.partition("/option/")[0]] = float(message.data)
     has_views = False
@@ -242,7 +241,7 @@ def _folder(topic: str) -> str:
 
 def _seconds(message: Any, logged: int) -> float:
     """The stamp of a message; its log time if the message has no stamp [s]."""
-    return header_seconds(to_plain(message.header.stamp)) or 1e-9 * logged
+    return header_seconds(to_plain(message.header.stamp), logged)
 
 
 def _intrinsics(topic: str, info: Any, image: Any) -> tuple[float, float, float, float]:
@@ -269,6 +268,7 @@ def _depth(where: str, image: Any, unit: float | None) -> Float[ndarray, "h w"]:
     rows = np.asarray(image.data, np.uint8).reshape(image.height, image.step)
     size = np.dtype(kind).itemsize * image.width
     pixels = np.ascontiguousarray(rows[:, :size]).view((">" if image.is_bigendian else "<") + kind)
+    pixels = pixels.reshape(image.height, image.width)  # fails if the rows are too short for the encoding
     if kind == "u2":
         scale = scale if unit is None else unit
         pixels = np.where(pixels == INTEGER_NO_RETURN, 0, pixels)
@@ -298,8 +298,8 @@ class TransformHistory:
         self._poses: dict[str, list[tuple[float, Pose]]] = {}
         """Sorted by time: messages may be logged in another order than that of their stamps."""
 
-    def add(self, message: Mapping[str, Any], static: bool) -> None:
-        """Add a geometry_msgs/TransformStamped, as plain data."""
+    def add(self, message: Mapping[str, Any], static: bool, logged: int = 0) -> None:
+        """Add a geometry_msgs/TransformStamped, as plain data. logged: its log time [ns]."""
         child = message["child_frame_id"].lstrip("/")
         place = message["transform"]["translation"]
         turn = message["transform"]["rotation"]
@@ -308,7 +308,7 @@ class TransformHistory:
         self._parent[child] = message["header"]["frame_id"].lstrip("/")
         if static:
             self._static.add(child)
-        stamped = header_seconds(message["header"]["stamp"]), T
+        stamped = header_seconds(message["header"]["stamp"], logged), T
         insort(self._poses.setdefault(child, []), stamped, key=itemgetter(0))
 
     def at(self, base: str, frame: str, stamp: float, where: str) -> Pose:

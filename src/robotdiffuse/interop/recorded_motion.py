@@ -1,4 +1,4 @@
-"""Reads motions from files of other programs, and converts them to motions of a robot.
+"""Reads motions from files of other programs, and converts them to motions of a robot; writes YAML.
 
 The formats are JSON, YAML and CSV, with ROS and MoveIt messages or RobotDiffuse's own records. Also publishes
 motions through rosbridge.
@@ -6,7 +6,7 @@ motions through rosbridge.
 
 import csv
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path as FilePath
 from time import sleep
 from typing import Any
@@ -17,8 +17,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, counted, joined, needs, reading, shown
-from robotdiffuse.core.input_files import MAX_YAML_SIZE, parse_yaml, read_json, read_text
-from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.files import MAX_YAML_SIZE, parse_yaml, read_json, read_text, write_atomically
 from robotdiffuse.core.types import (
     RATES,
     ROWS,
@@ -107,7 +106,8 @@ class RobotMotion:
 def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
     """The motion of a robot's planned joints, matched by name.
 
-    The recording may contain other joints of the robot, if these stay at their locked values. Missing
+    Jumps of continuous joints by whole turns are removed. The recording may contain other joints of the
+    robot, if these stay at their locked values. Missing
     velocities are those of the cubic spline through the rows that starts and ends at rest. A missing
     acceleration is the mean of the accelerations of the two cubics that meet at its row.
     Raises InputError for missing or unknown joints, and for other joints that leave their locked values.
@@ -191,7 +191,6 @@ def problem_of_motion(motion: RecordedMotion, robot: Robot, scene: Scene) -> Pro
         name: float(motion.positions[0, j]) for j, name in enumerate(motion.joint_names) if name in movable
     }
     robot = robot.with_locked(locked)
-    motion = replace(motion, notes=())
     q = motion_of_robot(motion, robot).motion.positions
     return Problem(robot, scene, q[0], JointGoal(q[-1:]))
 
@@ -204,7 +203,10 @@ TIMES = ("time", "t", "time_from_start", "timestamp")
 """Names that the column of times may have."""
 KINDS = {"position": "positions", "velocity": "velocities", "acceleration": "accelerations"}
 """Quantity of a column, by the ending of the column's name."""
-SUPPORTED = "it must hold a RobotDiffuse result, a JointTrajectory, RobotTrajectory or DisplayTrajectory"
+SUPPORTED = (
+    "it must hold a RobotDiffuse result, trajectory or path (joint_names and waypoints), a JointTrajectory, "
+    "RobotTrajectory or DisplayTrajectory"
+)
 
 
 def read_json_file(file: FilePath, topic: str | None = None) -> RecordedMotion:
@@ -271,7 +273,9 @@ def _only(trajectories: Any) -> RecordedMotion:
         return _motion(trajectories)
     if not isinstance(trajectories, list) or len(trajectories) != 1:
         count = (
-            f"has {counted(len(trajectories), 'part')}" if isinstance(trajectories, list) else "is no list"
+            f"has {counted(len(trajectories), 'part')}"
+            if isinstance(trajectories, list)
+            else f"is {shown(trajectories)}"
         )
         raise InputError(f"trajectory {count}; it must be a trajectory, or a list of one")
     return _motion(trajectories[0])
@@ -301,11 +305,12 @@ def _list(value: Any) -> list[Any]:
 
 
 def _seconds(where: str, value: Any) -> float:
-    """Seconds of a ROS 2 (sec, nanosec) or ROS 1 (secs, nsecs) duration, or of a plain number."""
+    """Seconds of a duration of ROS 2 (sec, nanosec), ROS 1 (secs, nsecs) or Foxglove (sec, nsec), or of a
+    plain number."""
     parts: tuple[Any, Any] = (value, 0)
     if isinstance(value, Mapping):
-        for seconds_name, nanoseconds_name in (("sec", "nanosec"), ("secs", "nsecs")):
-            if seconds_name in value:
+        for seconds_name, nanoseconds_name in (("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec")):
+            if seconds_name in value and not value.keys() - {seconds_name, nanoseconds_name, "__msgtype__"}:
                 parts = (value[seconds_name], value.get(nanoseconds_name, 0))
     if not all(isinstance(part, int | float) and not isinstance(part, bool) for part in parts):
         raise InputError(f"{where} is {shown(value)}; it must be a duration: sec and nanosec")
@@ -389,7 +394,8 @@ def publish(trajectory: Trajectory, host: str, port: int, topic: str, timeout: f
     """Publish a trajectory once through rosbridge, as a JointTrajectory. The caller must have validated it.
 
     ROS does not confirm deliveries, so the caller does not learn whether a subscriber received the message.
-    Raises InputError if no rosbridge answers within `timeout` [s].
+    Raises InputError if roslibpy is not installed, if no rosbridge answers within `timeout` [s], and for rows
+    less than 1 ns apart.
     """
     with needs("roslibpy", "ros"):
         import roslibpy

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from robotdiffuse.core.errors import needs
-from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Pose, Trajectory
 from robotdiffuse.drawables import Drawable, Surface, drawables, link_surfaces, own_frame
@@ -24,7 +24,7 @@ FPS = 60.0
 def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     """Write the entities scene/NAME, robot/LINK with its mesh, joints/NAME/positions and
     joints/NAME/velocities; see `interop.write_motion`. Scene and robot are in the world's frame if the
-    problem has a `base`, else in the base's frame."""
+    problem has a `T_world_base`, else in the base's frame."""
     robot = problem.robot
     recording = rr.RecordingStream("robotdiffuse", recording_id=file.stem)
     # Recorded in memory, since Rerun's thread prints a long message if it cannot write a file.

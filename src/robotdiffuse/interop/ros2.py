@@ -1,4 +1,5 @@
-"""ROS 2 without ROS: messages, MCAP files and bags (folders with metadata.yaml and a database); ROS 1 bags.
+"""ROS 2 without ROS: messages, MCAP files and bags (folders with metadata.yaml and a database). Reads also
+bags that hold MCAP files, and ROS 1 bags.
 
 In MCAP files, three kinds of topics hold Foxglove messages: /scene has the obstacles, and the arm as
 triangles that are fixed to its links; /tf has the poses of the base, links and moving obstacles; /points/NAME
@@ -23,9 +24,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robotdiffuse.core.errors import InputError, OutputError, needs, reading, shown
-from robotdiffuse.core.input_files import MAX_FILE_SIZE, MEGABYTE, input_file, parse_json, read_yaml
-from robotdiffuse.core.output_files import replaced_folder, write_atomically
+from robotdiffuse.core.errors import InputError, OutputError, joined, needs, reading, shown
+from robotdiffuse.core.files import (
+    MAX_FILE_SIZE,
+    MEGABYTE,
+    JsonObject,
+    input_file,
+    parse_json,
+    read_yaml,
+    replaced_folder,
+    write_atomically,
+)
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Configuration, Pose, Trajectory
 from robotdiffuse.drawables import Color, Drawable, Surface, drawables, link_surfaces
@@ -105,9 +114,8 @@ def typestore() -> Typestore:
 def to_message(kind: str, record: Mapping[str, Any]) -> Any:
     """A message from plain data; missing fields are empty or zero."""
     store = typestore()
-    field_types = store.fielddefs[kind][1]
     return store.types[kind](
-        **{name: _value(definition, record.get(name)) for name, definition in field_types}
+        **{name: _value(definition, record.get(name)) for name, definition in store.fielddefs[kind][1]}
     )
 
 
@@ -125,7 +133,7 @@ def _value(definition: Any, value: Any) -> Any:
     return [_value(element, item) for item in items]
 
 
-def to_plain(message: Any) -> dict[str, Any]:
+def to_plain(message: Any) -> JsonObject:
     """A message as plain data."""
     return asdict(
         message,
@@ -135,14 +143,14 @@ def to_plain(message: Any) -> dict[str, Any]:
     )
 
 
-def joint_state(robot: Robot, q: Configuration, at: int) -> dict[str, Any]:
+def joint_state(robot: Robot, q: Configuration, at: int) -> JsonObject:
     """A JointState in plain data, with the locked joints. at: time [ns]."""
     names = [*robot.joint_names, *robot.locked]
     positions = [*q.tolist(), *robot.locked.values()]
     return {"header": {"stamp": time_message(at)}, "name": names, "position": positions}
 
 
-def display_trajectory(problem: Problem, trajectory: Trajectory, record: Mapping[str, Any]) -> dict[str, Any]:
+def display_trajectory(problem: Problem, trajectory: Trajectory, record: Mapping[str, Any]) -> JsonObject:
     """A DisplayTrajectory in plain data: the JointTrajectory `record`, and the arm's start state."""
     robot = problem.robot
     return {
@@ -152,9 +160,10 @@ def display_trajectory(problem: Problem, trajectory: Trajectory, record: Mapping
     }
 
 
-def header_seconds(stamp: Mapping[str, Any]) -> float:
-    """The time stamp of a message header [s]."""
-    return stamp["sec"] + 1e-9 * stamp["nanosec"]
+def header_seconds(stamp: Mapping[str, Any], logged: int = 0) -> float:
+    """The time stamp of a message header [s]; the log time if the message has no stamp. logged: the log time
+    [ns]."""
+    return (stamp["sec"] + 1e-9 * stamp["nanosec"]) or 1e-9 * logged
 
 
 def choose_topic(topics: Mapping[str, str], requested: str | None, where: str) -> str:
@@ -162,8 +171,8 @@ def choose_topic(topics: Mapping[str, str], requested: str | None, where: str) -
 
     It is `requested` if that is given. Otherwise, the types JointTrajectory, RobotTrajectory,
     DisplayTrajectory and JointState are tried in this order, and the first one that occurs must have a single
-    topic. Raises InputError if `requested` or every topic has another type, or if several topics have the
-    first.
+    topic. Raises InputError if there is no topic `requested` or it has none of these types, if no topic has
+    one of them, and if several topics have the type that is chosen.
     """
     kinds = (JOINT_TRAJECTORY, ROBOT_TRAJECTORY, DISPLAY_TRAJECTORY, JOINT_STATE)
     listed = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"
@@ -203,12 +212,20 @@ def motion_from_messages(kind: str, messages: list[tuple[int, Any]], where: str)
     rows: dict[str, list[list[float]]] = {"position": [], "velocity": []}
     for i, state in enumerate(states):
         if sorted(state["name"]) != sorted(names):
-            raise InputError(f"{where}: joint state {i} has other joints than the first")
+            mistake = f"joint state {i} has the joints {joined(state['name'])}"
+            raise InputError(f"{where}: {mistake}; the first has {joined(names)}; all must have the same")
         column_of = {name: k for k, name in enumerate(state["name"])}
         order = [column_of[name] for name in names]
         for quantity, column in rows.items():
             column.append([state[quantity][k] for k in order] if len(state[quantity]) == len(names) else [])
-    velocities = rows["velocity"] if all(rows["velocity"]) else None
+    has_values = [len(row) > 0 for row in rows["velocity"]]
+    if any(has_values) and not all(has_values):
+        i = has_values.index(False)
+        mistake = f"joint state {i} has {len(states[i]['velocity'])} velocities for {len(names)} joints"
+        raise InputError(
+            f"{where}: {mistake}, other states have one for each; all must have one for each joint, or none"
+        )
+    velocities = rows["velocity"] if all(has_values) else None
     first = stamps[0]
     with reading(where):
         return checked_motion(names, rows["position"], [stamp - first for stamp in stamps], velocities)
@@ -243,7 +260,7 @@ class McapWriter:
             self._channels[topic] = self.writer.register_channel(topic, "protobuf", schema)
         self._add(topic, content.SerializeToString(), at)
 
-    def ros(self, topic: str, kind: str, content: dict[str, Any], at: int) -> None:
+    def ros(self, topic: str, kind: str, content: JsonObject, at: int) -> None:
         if topic not in self._channels:
             text, _ = typestore().generate_msgdef(kind, ros_version=2)
             schema = self.writer.register_schema(kind, "ros2msg", text.encode())
@@ -404,14 +421,14 @@ def problem_in(file: Path) -> Problem | None:
         if PROBLEM_ATTACHMENT not in attached:
             return None
         record = parse_json(attached[PROBLEM_ATTACHMENT].decode(), f"{file}, {PROBLEM_ATTACHMENT}")
-    return problem_from_record(record)
+        return problem_from_record(record)
 
 
 def checked_reader(stream: io.BufferedReader, where: str) -> McapReader:
     """The reader of an MCAP file.
 
-    Raises InputError, naming `where`, if the file does not end as MCAP files do, and if a chunk unpacks to
-    more than MAX_UNPACKED bytes, since small files may unpack to gigabytes.
+    Raises InputError, naming `where`, if the file does not end as MCAP files do, and if the index or the head
+    of a chunk states more than MAX_UNPACKED unpacked bytes, since small files may unpack to gigabytes.
     """
     stream.seek(-min(len(MCAP0_MAGIC), os.fstat(stream.fileno()).st_size), io.SEEK_END)
     if stream.read() != MCAP0_MAGIC:
@@ -437,7 +454,7 @@ def checked_reader(stream: io.BufferedReader, where: str) -> McapReader:
 
 
 def _types_of(schema: Any) -> Any:
-    """A store with the message types of a topic, as the file defines them."""
+    """A store with the message types of a topic, as the file defines them; without ros2msg, `typestore`."""
     if schema.encoding != "ros2msg":
         return typestore()
     store = get_typestore(Stores.EMPTY)
@@ -480,8 +497,9 @@ def write_bag(problem: Problem, trajectory: Trajectory, file: Path) -> None:
 
 @contextmanager
 def _opened_bag(file: Path) -> Iterator[AnyReader]:
-    """A reader of a ROS 1 bag or of the folder of a ROS 2 bag. Raises InputError for chunks that unpack to
-    more than MAX_UNPACKED bytes."""
+    """A reader of a ROS 1 bag or of the folder of a ROS 2 bag. Raises InputError for a folder without
+    metadata.yaml, for parts that are not regular files, for a compressed ROS 2 bag, and for chunks that
+    unpack to more than MAX_UNPACKED bytes."""
     if file.is_dir():
         if not (file / "metadata.yaml").is_file():
             raise InputError(f"{file} is not a ROS 2 bag: it has no metadata.yaml")
@@ -539,7 +557,7 @@ class Recording(NamedTuple):
     def messages(self, topics: Sequence[str], allowed: int = sys.maxsize) -> Iterator[tuple[str, int, Any]]:
         """Topic, log time [ns] and message of all messages on some topics, in the order of their log times.
 
-        allowed: largest size of all the messages together [bytes].
+        allowed: largest size of all the messages together [bytes]; raises InputError beyond it.
         """
         left = allowed
         for topic, at, content, read in self.records(topics) if topics else ():

@@ -39,10 +39,11 @@ fraction is below MIN_AGREEMENT, since objects in front of the arm may hide it."
 BETTER = 1.5
 """A mistake is named only if undoing it raises the agreement by at least this factor."""
 STANDS_OUT = 0.2
-"""A mistake is named only if undoing it gives this much larger a fraction of the arm's cells the arm's depth
-than if the arm's image is also moved to any side: a table may have the depth of the arm, but everywhere."""
+"""A mistake is named only if undoing it stands out: the fraction of the arm's cells with the arm's depth must
+fall by this much if the arm's image is then moved by any of SHIFTS. It falls less if these depths are from a
+table, which has similar depths all around."""
 SHIFTS = ((0, 12), (0, -12), (12, 0), (-12, 0))
-"""These movements, down and to the right [cells]."""
+"""Movements of the arm's image, down and to the right [cells]."""
 MIN_THROUGH = 0.35
 """An image that sees through at least this fraction of the arm gets a note even if no mistake explains it."""
 OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -167,8 +168,7 @@ def _camera_note(view: DepthView, robot: Robot, joint_values: tuple[float, ...])
         agrees, _, other_count = _compared(cells, arm)
         if other_count < MIN_CELLS or agrees <= highest:
             continue
-        moved = [_compared(cells, np.roll(arm, shift, (0, 1)))[0] for shift in SHIFTS]
-        if max(moved) < agrees - STANDS_OUT:
+        if max(_compared(cells, np.roll(arm, shift, (0, 1)))[0] for shift in SHIFTS) < agrees - STANDS_OUT:
             best = name
             highest = agrees
     if best or count < MIN_CELLS or through < MIN_THROUGH:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float32, Int32
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.errors import InputError, check_type, form, numbers, shown
+from robotdiffuse.core.errors import InputError, form, numbers, shown
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Points, Values, for_kernels
 from robotdiffuse.perception.depth_view import FARTHEST, NEAREST, DepthNoise, DepthView
@@ -120,7 +120,8 @@ class FilteredDepth(NamedTuple):
 def filtered(view: DepthView) -> FilteredDepth:
     """The view's image; if it is noisy, filtered by `median_filter` and `smoothed`.
 
-    Images made from clouds count as free of noise, since their pixels are not those of a sensor. The last 32
+    Images made from clouds count as free of noise, since their pixels are not those of a sensor; so do images
+    without a stated noise that are too small for `patch_noise`. The last 32
     results are cached, because planning with views uses each image several times.
     """
     depth = np.maximum(for_kernels(view.depth, np.float32), np.float32(0.0))
@@ -135,8 +136,9 @@ def filtered(view: DepthView) -> FilteredDepth:
         spread, neighbor_correlation = patch_noise(depth)
         squared_length = correlation_length(neighbor_correlation) ** 2
     else:
-        # the median does not reduce the part of the errors that neighboring pixels have in common
-        together = np.exp(-1 / noise.correlation**2) if noise.correlation > 0 else 0.0
+        # the median does not reduce the part of the errors that neighboring pixels share; this part is taken
+        # to be the correlation of diagonal neighbors
+        together = np.exp(-1 / max(noise.correlation, 0.01) ** 2)
         spread *= MEDIAN_SPREAD + (1 - MEDIAN_SPREAD) * float(together)
         squared_length = noise.correlation**2 + MEDIAN_LENGTH**2
     smooth, flat_share = smoothed(depth, spread)
@@ -147,7 +149,8 @@ def filtered(view: DepthView) -> FilteredDepth:
 
 def patch_noise(depth: Float32[ndarray, "h w"]) -> tuple[float, float]:
     """The standard deviation of an image's depth at a distance of 1 m [m], measured on flat patches, and the
-    correlation of the errors of neighboring pixels; both are 0 for images with few returns.
+    correlation of the errors of neighboring pixels; both are 0 if fewer than MIN_PATCHES patches have enough
+    returns, as in images of 64 x 48 pixels.
 
     On a flat surface, inverse depth is a linear function of the pixel. If the error of depth grows with the
     square of the depth, the error of inverse depth is the same everywhere.
@@ -223,8 +226,9 @@ def empty_regions(
     of the image with no near surface beside them. None if there is no such pixel, or the image is cropped.
 
     Regions that do not reach the border are left out, since they may be dark or reflecting surfaces. reach:
-    the sensor's range [m] if known; an image in which returns end along one row because a surface, such as
-    the floor, leaves the range is not cropped. arm: the pixels of the arm, which may be closer than TOO_NEAR.
+    the sensor's range [m], if known. It avoids a mistake: if a surface such as the floor leaves the range,
+    returns end along one row, but the image is not cropped. arm: the pixels of the arm, which may be closer
+    than TOO_NEAR.
     """
     no_return = ~(depth > 0)
     lost = no_return[::2, ::2]
@@ -235,8 +239,8 @@ def empty_regions(
     large_regions = wide_regions(lost, EMPTY_EDGE)
     half = depth[::2, ::2]
     in_range = ~lost & (half < AT_RANGE * (np.inf if reach is None else reach))
-    # cropped: counted from one of the four sides, the first row with returns well within the range borders a
-    # large region in many columns
+    # The image counts as cropped if, counted from one of its four sides, the first row with returns well
+    # within the range lies next to a large region in many columns.
     kinds = large_regions + 2 * in_range
     for rows in (kinds, kinds.T, kinds[::-1], kinds.T[::-1]):
         first = int((rows == 2).any(axis=1).argmax())
@@ -262,9 +266,9 @@ def empty_regions(
 
 
 GRAZED_WIDTH = 0.04
-"""A board that is seen almost edge-on gives no return, as open space does. So a pixel without a return shows
-open space behind a surface only if its distance from the surface in the image, measured at the surface's
-depth, is larger than this [m]."""
+"""A board that is seen almost edge-on gives no return, as open space does. So pixels without a return that
+are this near to a surface in the image do not show that the space behind the surface is open [m]. Pixels are
+converted to meters at the surface's depth."""
 DEPTH_FACTOR = 1.5
 """Surfaces whose depths differ by less than this factor are widened by the same number of pixels."""
 
@@ -274,14 +278,14 @@ def open_depth(
 ) -> Float32[ndarray, "h w"]:
     """The depths to assume for pixels without a return where nothing seems to be in range.
 
-    They are infinite, except within GRAZED_WIDTH of a surface other than the arm. There they are -d for the
-    nearest such surface, of depth d: only the space up to d is free; see `observed_volume`. focal: focal
-    length [pixels].
+    They are infinite, except within GRAZED_WIDTH of a surface other than the arm. There they are -d, where d
+    is the smallest depth of such surfaces: only the space up to d is free; see `observed_volume`. focal:
+    focal length [pixels].
     """
     from scipy.ndimage import minimum_filter
 
     half = depth[::2, ::2]
-    surface = np.where((half > 0) & ~arm[::2, ::2], half, np.float32(np.inf))
+    surface = np.where((half >= NEAREST) & ~arm[::2, ::2], half, np.float32(np.inf))
     opening = np.full(half.shape, np.inf, np.float32)
     nearest = float(surface.min())
     while np.isfinite(nearest):
@@ -327,8 +331,8 @@ def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
         of one image, whichever gives the larger spread; and the fraction of dropouts.
 
     Raises:
-        InputError: For fewer than two images, for images of different sizes, if no pixel has a return in
-            all images, and if the depths cannot be in meters.
+        InputError: For anything but a list of two or more images h x w of one size, if no pixel has a return
+            in all images, if the depths cannot be in meters, and for a spread above 0.1 m.
 
     Examples:
         >>> rng = np.random.default_rng(0)
@@ -336,11 +340,12 @@ def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
         >>> round(rd.measure_noise(images).spread, 3)
         0.002
     """
-    check_type("images", images, (list, tuple, ndarray), "a list of depth images")
-    forms = [form(numbers(image)) for image in images]
+    rows = images if isinstance(images, list | tuple) else np.atleast_1d(np.asarray(images))
+    arrays = [numbers(image) for image in rows]
+    forms = [*map(form, arrays)]
     if len(forms) < 2 or len({*forms}) > 1 or forms[0].count(" x ") != 1:
         raise InputError(f"images are {shown(forms)}; at least two images of one size, h x w, are needed")
-    stack = np.array(images, np.float32)
+    stack = np.array(arrays, np.float32)
     seen = np.isfinite(stack) & (stack > 0)
     always = np.equal(seen.sum(axis=0), len(stack))
     if not always.any():

@@ -22,6 +22,7 @@ from robotdiffuse.core.errors import (
     check_type,
     form,
     numbers,
+    points,
     positive,
     rigid_motion,
     rigid_transform,
@@ -29,7 +30,7 @@ from robotdiffuse.core.errors import (
     shown,
     vector,
 )
-from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
+from robotdiffuse.core.settings import Bound, Positive, Settings
 from robotdiffuse.core.transforms import placed
 from robotdiffuse.core.types import Configuration, Points, Pose, Value, frozen_dataclass, no_type_check
 from robotdiffuse.scenes.shapes import PointCloud
@@ -41,7 +42,8 @@ MIN_FOCAL_LENGTH = 1e-3
 NEAREST = 0.05
 """Nearer returns are ignored: they come from something that covers the lens [m]."""
 FARTHEST = 50.0
-"""If half of an image's returns are farther, it is not in meters, or has a number for no return [m]."""
+"""If half of an image's returns are farther [m], its depths are not in meters, or one number in it means "no
+return"."""
 MAX_ANGLE = 0.5
 """Largest angle that `DepthView.pose_deviation` may state [rad]."""
 INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -55,11 +57,14 @@ MAX_CLOUD_HEIGHT = 240
 class DepthView(Value):
     """A depth image of a pinhole camera, in the frame of the robot's base.
 
-    A pixel without a return (0, negative or not a number) says nothing: its ray may be free or occupied. A
-    pixel of +inf, or above 1e4, means that nothing is within the camera's range (as in ROS, REP 117).
+    A pixel without a return (less than 0.05, such as 0, or NaN) says nothing: its ray may be free or
+    occupied. A pixel of +inf, or above 1e4, means that nothing is within the camera's range (as in ROS, REP
+    117).
 
     Raises:
-        InputError: For arrays of the wrong shape, and for matrices that are not poses.
+        InputError: For arrays of the wrong shape, a matrix that is no pose, intrinsics with skew, other names
+            or a focal length below MIN_FOCAL_LENGTH, a `range` that is not positive, a negative
+            `pose_deviation` or one with an angle above MAX_ANGLE, and a `noise` that is no DepthNoise.
     """
 
     depth: Float32[ndarray, "h w"]
@@ -77,9 +82,9 @@ class DepthView(Value):
     source: dict[str, str | float] | None = None
     """The image's entry in problem files: a file as `depth`, and its `scale`; or a file as `cloud`."""
     range: float | None = None
-    """Largest distance that the sensor measures [m]. If it is given, large regions of 0 at the border of the
-    image mean that nothing is within this distance, unless the image seems to be cropped there. None: a pixel
-    of 0 has no meaning."""
+    """Largest distance that the sensor measures [m]. If it is given, large regions of 0 or NaN at the border
+    of the image mean that nothing is within this distance, unless the image seems to be cropped there. None:
+    such a pixel has no meaning."""
     noise: "DepthNoise | None" = None
     """Noise of the sensor, as `measure_noise` returns it; None: estimated from the image."""
     pose_deviation: tuple[float, float] = (0.0, 0.0)
@@ -90,29 +95,24 @@ class DepthView(Value):
         depth = numbers(self.depth)
         if depth is None or depth.ndim != 2 or depth.size == 0:
             raise InputError(f"view.depth is {form(depth)}; it must be an image of height x width")
-        intrinsics = vector("view", "intrinsics", _four_intrinsics(self.intrinsics), 4, MAX_RATE)
-        if min(intrinsics[:2]) < MIN_FOCAL_LENGTH:
-            requirement = f"fx and fy must be at least {MIN_FOCAL_LENGTH:g} [pixels]"
-            raise InputError(f"view.intrinsics is {shown(intrinsics)}; {requirement}")
         configuration = self.configuration
         if configuration is not None:
-            array = numbers(configuration)
-            configuration = vector("view", "configuration", configuration, 1 if array is None else array.size)
+            configuration = vector("view", "configuration", configuration, None)
         deviation = vector("view", "pose_deviation", self.pose_deviation, 2)
         if min(deviation) < 0 or deviation[1] > MAX_ANGLE:
             raise InputError(
                 f"view.pose_deviation is {shown(self.pose_deviation)}; it must be a position [m] and an angle"
-                f" up to {MAX_ANGLE:g} [rad]"
+                f" up to {MAX_ANGLE:g} [rad], both at least 0"
             )
-        if self.range is not None:
-            positive("view", "range", self.range)
         check_type("view.noise", self.noise, (DepthNoise, type(None)), "what rd.measure_noise returns")
         depth = np.where(depth > MAX_COORDINATE, np.inf, depth).astype(np.float32)
         for key, value in {
             "depth": depth,
-            "intrinsics": tuple(intrinsics.tolist()),
+            "intrinsics": checked_intrinsics("view", self.intrinsics),
             "T_base_camera": rigid_transform("view.T_base_camera", self.T_base_camera),
             "configuration": configuration,
+            "range": None if self.range is None else positive("view", "range", self.range),
+            "cloud": None if self.cloud is None else points("view", "cloud", self.cloud),
             "pose_deviation": tuple(deviation.tolist()),
         }.items():
             object.__setattr__(self, key, value)
@@ -142,7 +142,7 @@ class DepthView(Value):
         """
         if self.cloud is not None:
             return self.cloud
-        v, u = np.nonzero(np.isfinite(self.depth) & (self.depth > 0))
+        v, u = np.nonzero(np.isfinite(self.depth) & (self.depth >= NEAREST))
         z = self.depth[v, u].astype(np.float64)
         return placed(self.T_base_camera, unprojected(self, u, v, z))
 
@@ -153,14 +153,15 @@ class DepthView(Value):
             T: The rigid motion, a homogeneous transform [4, 4].
 
         Returns:
-            The view after the motion.
+            The view after the motion; of a view of a cloud file, `source` is None.
 
         Raises:
             InputError: Unless T is rigid.
         """
         T = rigid_motion(T)
         cloud = None if self.cloud is None else placed(T, self.cloud)
-        return replace(self, T_base_camera=T @ self.T_base_camera, cloud=cloud)
+        source = self.source if cloud is None else None
+        return replace(self, T_base_camera=T @ self.T_base_camera, cloud=cloud, source=source)
 
     @classmethod
     def from_cloud(
@@ -186,7 +187,8 @@ class DepthView(Value):
             The view, which keeps the cloud.
 
         Raises:
-            InputError: If no point is in front of the camera, and for anything but n x 3 finite numbers.
+            InputError: If no point is in front of the camera, for a T_base_camera that is no pose, for points
+                that are not n x 3 finite numbers, and for a configuration that is not a list of numbers.
         """
         T = rigid_transform("view.T_base_camera", T_base_camera)
         points = rows("view.points", points, None, 3)
@@ -219,21 +221,28 @@ def unprojected(view: DepthView, u: ndarray, v: ndarray, z: ndarray) -> Points:
     return np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1)
 
 
-def _four_intrinsics(given: object) -> object:
-    """fx, fy, cx, cy from a mapping or a camera matrix; anything else is returned unchanged."""
+def checked_intrinsics(owner: str, given: object) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy [pixels] from four numbers, a mapping or a camera matrix, the field `intrinsics` of
+    `owner`. Raises InputError for anything else, skew, and focal lengths below MIN_FOCAL_LENGTH."""
     if isinstance(given, Mapping):
         if {*given} != {*INTRINSICS}:
-            raise InputError(f"view.intrinsics has {shown([*given])}; it must have {', '.join(INTRINSICS)}")
-        return [given[name] for name in INTRINSICS]
+            raise InputError(
+                f"{owner}.intrinsics has {shown([*given])}; it must have {', '.join(INTRINSICS)}"
+            )
+        given = [given[name] for name in INTRINSICS]
     matrix = numbers(given)
-    if matrix is None or matrix.shape != (3, 3):
-        return given
-    fx, skew, cx, _, fy, cy = matrix[:2].ravel()
-    if skew != 0 or matrix[1, 0] != 0 or not np.array_equal(matrix[2], (0, 0, 1)):
-        raise InputError(
-            f"view.intrinsics is {shown(matrix)}; it must be fx 0 cx, 0 fy cy, 0 0 1, without skew"
-        )
-    return [fx, fy, cx, cy]
+    if matrix is not None and matrix.shape == (3, 3):
+        fx, skew, cx, _, fy, cy = matrix[:2].ravel()
+        if skew != 0 or matrix[1, 0] != 0 or not np.array_equal(matrix[2], (0, 0, 1)):
+            raise InputError(
+                f"{owner}.intrinsics is {shown(matrix)}; it must be fx 0 cx, 0 fy cy, 0 0 1, without skew"
+            )
+        given = [fx, fy, cx, cy]
+    fx, fy, cx, cy = vector(owner, "intrinsics", given, 4, MAX_RATE).tolist()
+    if min(fx, fy) < MIN_FOCAL_LENGTH:
+        requirement = f"fx and fy must be at least {MIN_FOCAL_LENGTH:g} [pixels]"
+        raise InputError(f"{owner}.intrinsics is {shown([fx, fy, cx, cy])}; {requirement}")
+    return fx, fy, cx, cy
 
 
 class SeenPoints(PointCloud):
@@ -267,7 +276,7 @@ class DepthNoise(Settings, name="depth_noise"):
     an edge [m]."""
     grazing: Angle = 0.17
     """Surfaces at a smaller angle to the line of sight give no return [rad]."""
-    correlation: NotNegative = 0.0
+    correlation: Annotated[float, Bound(least=0.0, most=100.0)] = 0.0
     """Distance at which the correlation of the errors of two pixels has fallen to exp(-1/2) [pixels];
     recorded sensors have 1 to 3."""
     zeros: bool = False
@@ -293,14 +302,14 @@ class DepthNoise(Settings, name="depth_noise"):
             from scipy.ndimage import gaussian_filter
 
             errors = gaussian_filter(errors, self.correlation / np.sqrt(2), mode="wrap")
-            errors /= errors.std()
+            errors /= errors.std() or 1.0  # 0 in an image of one pixel
         depth[seen] += self.spread * depth[seen] ** 2 * errors[seen]
         stray = seen & (rng.random(depth.shape) < self.stray)
         depth[stray] *= rng.random(int(stray.sum()))
         depth[lost | (rng.random(depth.shape) < self.missing)] = 0.0
         if self.zeros:
             depth[np.isinf(depth)] = 0.0
-        return replace(view, depth=depth)
+        return replace(view, depth=depth, source=None)
 
     def _grazed(self, view: DepthView) -> Bool[ndarray, "h w"]:
         """Pixels that see their surface at a smaller angle than `grazing`."""

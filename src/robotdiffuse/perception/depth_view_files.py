@@ -5,8 +5,7 @@
   shelf.json, shelf.yaml, shelf.txt or shelf.npy
 - {cloud: shelf.ply, camera: {...}, configuration: [...]}
 
-Further fields are configuration and pose_deviation and, for images, range and noise. They have the same
-meaning as in DepthView.
+Further fields are configuration, pose_deviation, range and noise. They have the same meaning as in DepthView.
 """
 
 import warnings
@@ -31,7 +30,8 @@ from robotdiffuse.core.errors import (
     unit_quaternion,
     vector,
 )
-from robotdiffuse.core.input_files import (
+from robotdiffuse.core.files import (
+    JsonObject,
     input_file,
     known_ending,
     read_array,
@@ -44,7 +44,7 @@ from robotdiffuse.perception.depth_view import INTEGER_NO_RETURN, INTRINSICS, De
 from robotdiffuse.scenes.files import check_fields, name_from
 from robotdiffuse.scenes.point_cloud import read_points
 
-IMAGE_FIELDS = ("intrinsics", "scale", "range", "noise")
+IMAGE_FIELDS = ("intrinsics", "scale")
 INTRINSICS_FORMATS = (".json", ".yaml", ".txt", ".npy")
 MAX_PIXELS = 2**24
 """Maximum number of pixels of a depth image, in all channels: a small file can unpack to a huge image."""
@@ -56,8 +56,9 @@ def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "
     """A depth image [m] from a 16 bit .png, a .npy, a .npz (its array `depth`, or its only array), or a .exr.
 
     scale: meters per unit; None: 0.001 for integers, 1 for floating-point numbers. Integers of 65535, and
-    the largest of their type, count as 0, "no return". Raises InputError for a file that is missing or is not
-    a depth image.
+    the largest of their type, count as 0, "no return". Raises InputError for a file that is missing, is not a
+    depth image or has more than MAX_PIXELS, for a scale that is not positive, and for a .exr without the
+    package OpenEXR.
     """
     file = Path(file)
     read = _READERS[known_ending(file, "depth image", _READERS)]
@@ -109,12 +110,21 @@ def _read_exr(file: Path) -> ndarray:
     return np.asarray((depths or [*channels.values()])[0].pixels)
 
 
-def read_intrinsics(file: Path, size: tuple[int, ...]) -> Any:
+def _field(record: JsonObject, name: str) -> ndarray | None:
+    """The numbers of a field of camera_info, a list or a mapping with the list `data`; None if there are
+    none."""
+    entry = record.get(name)
+    return numbers(entry.get("data") if isinstance(entry, dict) else entry)
+
+
+def read_intrinsics(file: Path, size: tuple[int, ...], notes: list[str]) -> Any:
     """The intrinsics of a camera, in a form that DepthView accepts. size: height and width of its image.
+    Distortion is ignored, and noted in `notes`.
 
     A .npy or .txt file holds the camera matrix or fx, fy, cx, cy as numbers. A .json or .yaml file holds a
     camera_info of ROS, intrinsics written by librealsense or Open3D, or fx, fy, cx and cy by name. Raises
-    InputError for a file without intrinsics, and for one that states another size of the image.
+    InputError for a file that cannot be read or holds no intrinsics, for another ending, and for a file that
+    states another size of the image.
     """
     ending = known_ending(file, "intrinsics", (*INTRINSICS_FORMATS, ".yml"))
     input_file(file, "file of intrinsics")
@@ -132,10 +142,24 @@ def read_intrinsics(file: Path, size: tuple[int, ...]) -> Any:
         stated = tuple(record.get(name, record.get(f"image_{name}")) for name in ("height", "width"))
         if all(stated) and stated != size:
             raise InputError(f"{file} is for images of {shown(stated)} pixels, h x w; this one has {size}")
+        distorted = False
+        for name in ("D", "d", "distortion_coefficients", "coeffs"):
+            distortion = _field(record, name)
+            if distortion is not None and distortion.any():
+                notes.append(f"{file.name}: the distortion {name} is ignored; the image must be rectified")
+                distorted = True
+        for name in ("P", "p", "projection_matrix") if distorted else ():
+            matrix = _field(record, name)
+            if matrix is not None and matrix.size == 12 and matrix.flat[0] > 0:
+                return matrix.reshape(3, 4)[:, :3]
+        if record.get("depth_scale", 1) not in (1, 1000):  # these stand for millimeters in BOP and Open3D
+            notes.append(
+                f"{file.name}: depth_scale {shown(record['depth_scale'])} is ignored: state the meters per "
+                "unit of the image as scale"
+            )
         for name in ("K", "k", "cam_K", "camera_matrix", "intrinsic_matrix"):
             if name in record:
-                rows = record[name]["data"] if isinstance(record[name], dict) else record[name]
-                matrix = numbers(rows)
+                matrix = _field(record, name)
                 if matrix is None or matrix.size != 9:
                     break
                 matrix = matrix.reshape(3, 3)
@@ -179,7 +203,7 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
     source: dict[str, str | float] | None = None
     is_cloud = isinstance(entry, dict) and "cloud" in entry
     required = ("cloud", "camera") if is_cloud else ("depth", "camera")
-    optional = ("configuration", "pose_deviation", *(() if is_cloud else IMAGE_FIELDS))
+    optional = ("configuration", "pose_deviation", "range", "noise", *(() if is_cloud else IMAGE_FIELDS))
     values = check_fields(where, entry, required, optional)
     optional_fields = {
         name: values[name] for name in ("range", "pose_deviation") if values.get(name) is not None
@@ -196,7 +220,7 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
             file = str(folder / points)
             points, new_notes = read_points(file)
             notes.extend(new_notes)
-            source = {"cloud": file}
+            source = {"cloud": str(Path(file).absolute())}
         view = DepthView.from_cloud(points, T_base_camera, configuration, source)
         return replace(view, **optional_fields)
     image = values["depth"]
@@ -204,10 +228,11 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
     if isinstance(image, str):
         file = str(folder / image)
         image = read_depth(file, scale)
-        candidates = (Path(file).with_suffix(suffix) for suffix in INTRINSICS_FORMATS)
-        existing = (str(path) for path in candidates if path != Path(file) and path.is_file())
+        name = Path(values["depth"])
+        candidates = (name.with_suffix(suffix) for suffix in INTRINSICS_FORMATS)
+        existing = (str(path) for path in candidates if path != name and (folder / path).is_file())
         values.setdefault("intrinsics", next(existing, None))
-        source = {"depth": file} | ({} if scale is None else {"scale": scale})
+        source = {"depth": str(Path(file).absolute())} | ({} if scale is None else {"scale": scale})
     elif scale is not None:
         raise InputError(
             "view.scale cannot be combined with an image in the problem file, which is in meters"
@@ -217,14 +242,14 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
         files = ", ".join(INTRINSICS_FORMATS)
         raise InputError(f"{where} has no intrinsics, nor a file of them with the image's name ({files})")
     if isinstance(intrinsics, str):
-        intrinsics = read_intrinsics(folder / intrinsics, getattr(numbers(image), "shape", ()))
+        intrinsics = read_intrinsics(folder / intrinsics, getattr(numbers(image), "shape", ()), notes)
     return DepthView(image, intrinsics, T_base_camera, configuration, source=source, **optional_fields)
 
 
-def view_entry(view: DepthView, folder: Path | None) -> dict[str, Any]:
+def view_entry(view: DepthView, folder: Path | None) -> JsonObject:
     """The entry of a view, in the form that `read_views` reads. Data that were read from a file are written
     as the file's name, relative to the folder."""
-    entry: dict[str, Any] = {}
+    entry: JsonObject = {}
     if view.source is not None:
         entry |= {
             name: name_from(folder, Path(value)) if isinstance(value, str) else value
@@ -234,8 +259,7 @@ def view_entry(view: DepthView, folder: Path | None) -> dict[str, Any]:
         entry["cloud"] = view.cloud.tolist()
     else:
         # JSON has no NaN or infinity: missing returns become 0, and infinite depths 1e9
-        image = np.nan_to_num(view.depth, nan=0.0, posinf=1e9, neginf=0.0)
-        entry["depth"] = image.tolist()
+        entry["depth"] = np.nan_to_num(view.depth, nan=0.0, posinf=1e9, neginf=0.0).tolist()
     if view.cloud is None:
         entry["intrinsics"] = list(view.intrinsics)
     entry["camera"] = pose_entry(view.T_base_camera)

@@ -28,12 +28,12 @@ from robotdiffuse.perception.voxel_grid import COARSE, SHAPE, VoxelGrid
 from robotdiffuse.robots.robot import Robot
 
 # States of a voxel in a view.
-HIDDEN = 0  # not observed, for any other reason than those below
+HIDDEN = 0  # at a surface (then it may have points), or not observed for another reason than those below
 FREE = 1  # observed as entirely free
 BEHIND = 2  # behind a surface
 SHADOW = 3  # behind the arm
 OUT = 4  # outside the image
-LOST = 5  # on a ray without a return, so that something may be in range, or covered at the lens
+LOST = 5  # on a ray without a return, or behind a surface so near that it may cover the lens
 # Depths of pixels without a return. A depth of -d means that nothing is nearer than d to the camera.
 NO_RETURN = np.float32(0.0)
 EMPTY = np.float32(-1e-6)
@@ -63,7 +63,7 @@ PIXEL_SLACK = np.float32(0.01)
 DEPTH_SLACK = np.float32(1e-4)
 """Larger than the rounding errors of depths [m]."""
 FASTMATH = {"contract", "reassoc", "arcp", "nsz"}
-"""All fastmath flags except those that assume finite numbers."""
+"""The fastmath flags that do not assume finite numbers, without approximate functions (afn)."""
 _HALF = np.float32(0.5)
 _ONE = np.float32(1.0)
 _ZERO = np.float32(0.0)
@@ -129,7 +129,7 @@ def usable_image(
 
     If a pixel has no return and the camera seems to look into empty space there, its depth is infinite if the
     view states its range, otherwise EMPTY. Near a surface in the image it is -d instead of infinite, where d
-    is the surface's depth; see `open_depth`. If its ray meets the arm, it is -NEAREST.
+    is the surface's depth; see `open_depth`. If the pixel's ray meets the arm, the depth is -NEAREST.
     """
     T = view.T_base_camera
     depth = filtered(view).depth
@@ -475,7 +475,8 @@ def _carve_block(
 @kernel()
 def add_evidence(state, counts, evidence, hit, miss, largest):
     """Add the evidence of a view for each voxel [nx ny nz]: `hit` for voxels with points, -`miss` for free
-    voxels. The sum is clipped to [-largest, largest]. Returns the number of voxels with a first evidence."""
+    voxels. The sum is clipped to [-largest, largest]. Returns the number of observed voxels whose evidence
+    was 0 before."""
     state = state.ravel()
     counts = counts.ravel()
     evidence = evidence.ravel()
@@ -495,8 +496,8 @@ ARM_MARGIN = 0.015
 `grown_for_errors`."""
 NARROWED_SHARE = 0.35
 """Free space is narrowed by this fraction of the largest error of a camera's pose. Observed surfaces are
-inflated by the whole error. This covers most wrongly free voxels, so narrowing only has to cover those right
-behind an edge."""
+inflated by the whole error. The inflated surfaces cover most wrongly free voxels, so narrowing only has to
+cover those right behind an edge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -515,8 +516,8 @@ class ObservedVolume:
     """How far the voxel is behind an observed surface, the minimum over all views [m]; 0 if it is behind
     none, or observed."""
     lost: Bool[ndarray, "56 56 32"]
-    """The voxel is unknown and behind no other surface, and in some view its ray has no return, so that
-    something may be in range, or meets a surface nearer than LENS_DISTANCE."""
+    """The voxel is unknown, and in some view its ray has no return (so something may be in range) or meets a
+    surface nearer than LENS_DISTANCE. It is behind no other surface in any view."""
 
     @cached_property
     def unknown(self) -> Bool[ndarray, "56 56 32"]:
@@ -526,10 +527,10 @@ class ObservedVolume:
 def observe(views: Sequence[DepthView], robot: Robot, start: Configuration) -> ObservedVolume:
     """The volume observed by all views. A voxel is occupied if any view says so, else free if any does.
 
-    A voxel is free in a view if all pixels that it may cover are in the image and none is nearer than its far
-    side, which must be in range; at most half of these pixels may be without a return. start: the arm's
-    configuration in views that state none. Raises InputError if there are no views, or for a configuration of
-    the wrong length.
+    A voxel is free in a view if its far side is in range, all pixels that it may cover are in the image, no
+    depth of these pixels is nearer than the far side, and at least half of them have a return. start: the
+    arm's configuration in views that state none. Raises InputError if there are no views, or for a
+    configuration of the wrong length.
     """
     if not len(views):
         raise InputError("views is empty; at least one depth view is needed")
@@ -557,8 +558,8 @@ def merged(volumes: Sequence[ObservedVolume]) -> ObservedVolume:
 
 
 def observed_by(view: DepthView, robot: Robot, start: Configuration) -> ObservedVolume:
-    """The volume observed by one view. Without a surface in the image, the camera may be covered or broken:
-    all voxels are unknown."""
+    """The volume observed by one view. If the image has too few returns (see `shows_surface`), the camera may
+    be covered or broken: then no voxel is free, in shadow or lost."""
     q = start if view.configuration is None else view.configuration
     if len(q) != robot.dof:
         raise InputError(

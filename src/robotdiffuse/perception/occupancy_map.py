@@ -1,22 +1,27 @@
-"""OccupancyMap: which voxels of 2 cm around the arm are free, occupied or unknown, updated view by view; and
-ViewMemory: keeps the views that showed most new voxels.
+"""Unknown space, which no view saw: assumptions about it, the unknown space that a motion passes through, and
+the motion's probability to be free; OccupancyMap: which voxels of 2 cm around the arm are free, occupied or
+unknown, updated view by view; and ViewMemory: keeps the views that showed most new voxels.
+
+An assumption is a set of obstacles in addition to the observed ones. The space that the arm occupies at its
+start and goals is removed from them (carved out).
 """
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Int32, UInt8
+from jaxtyping import Bool, Float32, Int32, UInt8
 from numpy import ndarray
-from scipy.spatial import KDTree
 
+from robotdiffuse.collision.kernel_arrays import reach_bound
 from robotdiffuse.core import errors
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.locked import locked
-from robotdiffuse.core.types import Configuration, Points, Values
-from robotdiffuse.perception.depth_filter import PointErrors, filtered, point_errors
-from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.core.types import Configuration, Path, Points, Values
+from robotdiffuse.perception.depth_filter import PointErrors, filtered, point_errors, wide_regions
+from robotdiffuse.perception.depth_view import AssumedPoints, DepthView
 from robotdiffuse.perception.observed_volume import (
     FREE,
     HIDDEN,
@@ -26,9 +31,230 @@ from robotdiffuse.perception.observed_volume import (
     merged,
     observed_by,
 )
-from robotdiffuse.perception.seen_points import CELL, END_SPREADS, POINT_RADIUS, seen_points
-from robotdiffuse.perception.voxel_grid import MAP, Voxels
+from robotdiffuse.perception.seen_points import (
+    CELL,
+    END_SPREADS,
+    POINT_RADIUS,
+    near_scene,
+    seen_points,
+    sphere_distances,
+)
+from robotdiffuse.perception.voxel_grid import (
+    COARSE,
+    FINE,
+    MAP,
+    SHAPE,
+    Probabilities,
+    VoxelGrid,
+    Voxels,
+    heaviest_part,
+    refined,
+    surface,
+)
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+
+PADDINGS = (0.09, 0.06, 0.04)
+"""Radii to which observed points are inflated, the largest first [m]."""
+# Points nearer to the arm's covering spheres at start or goals than PADDING_FACTOR times their padding plus
+# PADDING_MARGIN [m] are left out: thinning may enlarge points by so much.
+PADDING_FACTOR = 1.3
+PADDING_MARGIN = 0.01
+THRESHOLDS = (0.1, 0.2, 0.35, 0.5)
+"""Probabilities above which a predicted voxel is an obstacle, the most cautious first."""
+CARVING_MARGIN = 0.02
+"""Voxels nearer to the arm's covering spheres at start or goals than this are carved out [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Padded:
+    """Observed points, inflated."""
+
+    points: Points
+    padding: float
+    """Radius of the inflated points [m]."""
+
+    @property
+    def name(self) -> str:
+        return f"points padded by {100 * self.padding:.0f} cm"
+
+    def touched(self, spheres: Float32[ndarray, "n 4"]) -> Bool[ndarray, "points"]:
+        """Which points touch the arm's covering spheres (x, y, z, radius [m]) at start or goals and have to
+        be carved out."""
+        return sphere_distances(self.points, spheres) < PADDING_FACTOR * self.padding + PADDING_MARGIN
+
+    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
+        """The obstacles without those that touch these spheres."""
+        return AssumedPoints(self.points[~self.touched(spheres)], self.padding, name="padded")
+
+
+@dataclass(frozen=True, eq=False)
+class OccupiedVoxels:
+    """Voxels of the observed volume, coarse or fine, that an assumption takes for occupied."""
+
+    name: str
+    occupied: Voxels
+    robot: Robot
+    known_scene: Scene
+    """Shapes that the problem states; voxels inside them are left out."""
+
+    @property
+    def grid(self) -> VoxelGrid:
+        return COARSE if self.occupied.shape == SHAPE else FINE
+
+    def touched(self, spheres: Float32[ndarray, "n 4"]) -> Voxels:
+        """Which voxels touch these spheres and have to be carved out."""
+        return self.occupied & self.grid.within(spheres, CARVING_MARGIN + self.grid.edge / 2)
+
+    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
+        """The occupied voxels at the boundary of the occupied region; the arm, which starts outside, cannot
+        reach inner ones. Voxels out of the arm's reach or in the known scene are left out."""
+        edge = self.grid.edge
+        points = self.grid.centers(surface(self.occupied & ~self.touched(spheres)))
+        points = points[np.linalg.norm(points, axis=1) < reach_bound(self.robot) + edge]
+        points = without_known(points, edge, self.robot, self.known_scene)
+        return AssumedPoints(points, edge / 2, name="unknown")
+
+
+Assumption = Padded | OccupiedVoxels
+"""Obstacles in unknown space, in addition to the observed ones."""
+
+
+def without_known(centers: Points, edge: float, robot: Robot, known_scene: Scene) -> Points:
+    """The centers of those voxels that are not in the known scene [m]. edge: edge of the voxels [m]."""
+    return centers[~near_scene(robot, known_scene, centers, edge / 2 - 1e-3)]
+
+
+Box = tuple[tuple[float, ...], tuple[float, ...]]
+"""Low and high corner [m]."""
+
+
+LOST_WIDTH = 3
+"""Smallest width [voxels of 4 cm] of lost regions. The images that the network was trained with had smaller
+ones, so it mistakes large ones for free space."""
+LOST_PROBABILITY = 0.15
+"""Smallest probability that a voxel of a lost region is occupied. Behind obstacles that gave no return it was
+0.18 on average, behind a hand before the lens 0.03 to 0.07."""
+
+
+def lost_regions(volume: ObservedVolume) -> Voxels:
+    """The fine voxels of regions at least LOST_WIDTH wide that are on rays without a return, or behind a
+    surface that may cover the lens; see `ObservedVolume.lost`."""
+    lost = volume.lost
+    return refined(wide_regions(lost, LOST_WIDTH) if lost.any() else lost)
+
+
+class UnknownSpace:
+    """The unknown voxels outside the arm at its start and goals, and their predicted probabilities."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        free_configurations: Iterable[Configuration],
+        unknown: Voxels,
+        predicted: Probabilities | None,
+        margin: float = CARVING_MARGIN,
+        grid: VoxelGrid = FINE,
+        lost: Voxels | None = None,
+    ) -> None:
+        """
+        free_configurations: configurations at which the arm is known to be free: the start and the goals.
+        unknown: the voxels of the grid that no view saw.
+        predicted: the probability that each voxel is occupied; None without a prediction.
+        margin: voxels nearer to the arm at these configurations than this count as occupied by it [m].
+        lost: see `lost_regions`; only confidences without a prediction depend on it.
+        """
+        self._robot = robot
+        self._grid = grid
+        self._lost = lost
+        self._elsewhere = ~grid.filled(robot, free_configurations, margin)
+        self.unknown = unknown & self._elsewhere
+        self.probability = None if predicted is None else np.where(self.unknown, predicted, np.float32(0))
+
+    def crossed(self, path: Path) -> "CrossedSpace":
+        """The unknown voxels that the arm passes through on a path."""
+        swept = self._grid.swept(self._robot, path) & self._elsewhere
+        crossed = swept & self.unknown
+        swept_count = max(int(swept.sum()), 1)
+        lost = 0.0 if self._lost is None else float((crossed & self._lost).sum()) / swept_count
+        return CrossedSpace(crossed, self.probability, self._grid, lost, float(crossed.sum()) / swept_count)
+
+
+@dataclass(frozen=True, eq=False)
+class CrossedSpace:
+    """The unknown space that a motion passes through."""
+
+    voxels: Voxels
+    probability: Probabilities | None
+    """Predicted probability that each voxel is occupied; None without a prediction."""
+    grid: VoxelGrid = FINE
+    lost_share: float = 0.0
+    """Fraction of the voxels on the motion that are in lost regions."""
+    unseen_share: float = 0.0
+    """Fraction of the voxels on the motion that no view saw."""
+
+    @cached_property
+    def risk(self) -> float | None:
+        """The summed probability of the voxels; None without a prediction."""
+        return None if self.probability is None else float(self.probability[self.voxels].sum(dtype=float))
+
+    @property
+    def region(self) -> Box | None:
+        """The bounding box of the connected part of the voxels with the largest summed probability or,
+        without a prediction, with the most voxels; None if there are no voxels."""
+        if not self.voxels.any():
+            return None
+        weights = np.ones(self.grid.shape, np.float32) if self.probability is None else self.probability
+        corners = heaviest_part(self.voxels, weights) * self.grid.edge + np.array(self.grid.low)
+        low, high = corners.round(3).tolist()
+        return tuple(low), tuple(high)
+
+
+RATES: dict[str, float] = {
+    "as seen": 0.64,
+    "points padded by 9 cm": 0.82,
+    "points padded by 6 cm": 0.7,
+    "points padded by 4 cm": 0.5,
+    "unknown is occupied": 0.99,
+}
+"""For each assumption, the fraction of the motions planned under it without a prediction that were free in
+the true scene. `python benchmarks/cameras.py --fit` prints these from its problems with even numbers."""
+
+UNSEEN_CONFIDENCE = 0.5
+"""Largest confidence of a motion with an unseen share above MAX_UNSEEN_SHARE."""
+MAX_UNSEEN_SHARE = 0.99
+
+# The log odds that a motion is free in the true scene are the first number plus the second times log(risk).
+# The risk is the sum of the predicted probabilities of the unknown voxels that the motion passes through.
+ONE_VIEW = (2.56, -0.66)
+"""Fitted to 820 motions from one view, by `python benchmarks/cameras.py --fit`."""
+EXPLORED = (4.05, -1.15)
+"""For motions of an Explorer, whose views left little unknown. Fitted to 493 motions of
+`benchmarks/exploring.py`, half of them with noise; see its report."""
+MIN_RISK = 0.2
+"""Smaller risks are raised to this."""
+
+
+def probability_free(risk: float, curve: tuple[float, float]) -> float:
+    """The probability that a motion with a risk is free in the true scene. curve: ONE_VIEW or EXPLORED."""
+    odds, slope = curve
+    return 1 / (1 + math.exp(-(odds + slope * math.log(max(risk, MIN_RISK)))))
+
+
+def confidence(assumption: str, crossed: CrossedSpace) -> float:
+    """The probability that a motion under an assumption is free in the true scene.
+
+    It follows from the risk. Without a prediction, it is the rate of the assumption in RATES, reduced in
+    proportion to the share of lost regions in the space that the motion passes through. It is at most
+    UNSEEN_CONFIDENCE if views saw hardly any of this space.
+    """
+    stated = (
+        RATES[assumption] * (1 - crossed.lost_share)
+        if crossed.risk is None
+        else probability_free(crossed.risk, ONE_VIEW)
+    )
+    return min(stated, UNSEEN_CONFIDENCE) if crossed.unseen_share > MAX_UNSEEN_SHARE else stated
+
 
 Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Low and high corner of a box [m]."""
@@ -43,8 +269,8 @@ MOST_EVIDENCE = np.float32(8.0)
 APPEARED_PADDING = 0.05
 """Radius of points that appear in space that was free before [m]: only the front of their object is seen."""
 MIN_APPEARED = 12
-"""An object appears only if a view has points in so many voxels that are deep in free space; in simulations
-with noise and inexact poses, errors filled up to 4."""
+"""An object appears only if a view has points in at least this many voxels that are deep in free space; in
+simulations with noise and inexact poses, errors filled up to 4."""
 COVER_RADIUS = MAP.edge * 3**0.5 / 2
 """Radius of the ball around a voxel's center that covers the voxel [m]."""
 
@@ -86,7 +312,7 @@ class OccupancyMap:
 
     @locked
     def add(self, view: DepthView, stamp: float = 0.0) -> int:
-        """Take a view into account. Returns the number of voxels that it observes for the first time.
+        """Take a view into account. Returns the number of voxels that it observes and that had no evidence.
 
         stamp: when the view was taken [s]. The view's `configuration` is that of the arm at this time. Raises
         InputError if the view has none, or one of the wrong length.
@@ -113,7 +339,8 @@ class OccupancyMap:
     @locked
     def add_points(self, points: Points, stamp: float = 0.0) -> None:
         """Take occupied points in the base frame into account [m], e.g. the points of an
-        `rd.PointCloud.from_file`. They give no information about free space."""
+        `rd.PointCloud.from_file`. They give no information about free space. Raises InputError for anything
+        but n x 3 numbers."""
         at = MAP.indices(errors.points("map", "points", points))
         at = at[MAP.contains(at)]
         counts = np.zeros(MAP.shape, np.int32)
@@ -122,8 +349,8 @@ class OccupancyMap:
 
     @locked
     def declare_free(self, zone: Corners) -> None:
-        """Voxels inside a box, given by its low and high corner, count as free unless a view finds them
-        occupied."""
+        """Voxels inside a box, given by its low and high corner [m], count as free unless a view finds them
+        occupied. Raises InputError unless these are two corners, the low one below the high one."""
         low, high = errors.rows("free_zone", zone, 2, 3)
         if not (low < high).all():
             raise InputError(f"free_zone is {shown(zone)}; its low corner must be below its high corner")
@@ -141,13 +368,12 @@ class OccupancyMap:
         error of its pose. points: observed points [m]. errors: how far each point may be displaced [m].
         """
         spheres = np.column_stack([points, POINT_RADIUS + errors])[errors > 0]
-        reached = MAP.within(spheres, COVER_RADIUS)
-        self._doubted = reached & ~self._surely_free
+        self._doubted = MAP.within(spheres, COVER_RADIUS) & ~self._surely_free
         self._known = None
 
     @property
     def is_blind(self) -> bool:
-        """Whether no view has observed any voxel."""
+        """Whether the map holds no evidence, of views or of points."""
         return not self._evidence.any()
 
     @property
@@ -171,8 +397,9 @@ class OccupancyMap:
             occupied = self._evidence > 0
             free = self._evidence < 0
             if self.max_age is not None:
-                occupied = occupied & self._fresh
-                free = free & self._fresh
+                fresh = self._fresh
+                occupied = occupied & fresh
+                free = free & fresh
             free = free & ~self._doubted | self._declared & ~occupied
             self._known = occupied, free, ~(free | occupied)
             for voxels in self._known:
@@ -180,9 +407,13 @@ class OccupancyMap:
         return self._known
 
     @property
+    def oldest(self) -> float:
+        """What views from before this time showed is forgotten [s]."""
+        return -np.inf if self.max_age is None else self._now - self.max_age
+
+    @property
     def _fresh(self) -> Voxels:
-        assert self.max_age is not None
-        return self._seen_at >= self._now - self.max_age
+        return self._seen_at >= self.oldest
 
     def _update(
         self,
@@ -191,9 +422,11 @@ class OccupancyMap:
         stamp: float,
         views: Sequence[DepthView] = (),
     ) -> int:
-        """Add a view's evidence for each voxel. Returns the number of voxels observed for the first time.
+        """Add a view's evidence for each voxel. Returns the number of observed voxels without evidence
+        before.
 
-        views: the view, if there is one. Its errors may displace surfaces, which then have not appeared.
+        views: the view, if there is one. A point counts as an object that appears only if it is deeper in
+        free space than the view's errors may have displaced it.
         """
         self._now = max(self._now, stamp)
         self._known = None
@@ -201,9 +434,10 @@ class OccupancyMap:
         self._surely_free[counts > 0] = False
         observed = (counts > 0) | (state == FREE)
         if self.max_age is not None:
-            self._evidence[~self._fresh] = 0.0
-            self._surely_free[~self._fresh] = False
-            self._seen_at[observed] = stamp
+            forgotten = ~self._fresh
+            self._evidence[forgotten] = 0.0
+            self._surely_free[forgotten] = False
+            self._seen_at[observed] = np.maximum(self._seen_at[observed], stamp)
         # an object that appears is there at once, however often its space was seen free before
         free = self._evidence < 0
         points = MAP.centers(np.argwhere((counts > 0) & free))
@@ -240,6 +474,8 @@ class _RememberedView:
     """Number of voxels that the view was the first to observe."""
     stated: DepthView
     """The view with the pose that the caller stated."""
+    stamp: float
+    """When the view was taken [s]."""
 
     @cached_property
     def volume(self) -> ObservedVolume:
@@ -265,13 +501,16 @@ class ViewMemory:
     def __len__(self) -> int:
         return len(self._memories)
 
-    def add(self, view: DepthView, new_voxels: int, stated: DepthView) -> None:
+    def add(self, view: DepthView, new_voxels: int, stated: DepthView, stamp: float, oldest: float) -> None:
         """Keep a view with a configuration. new_voxels: number of voxels that it was the first to observe.
-        stated: the same view with the pose that the caller stated."""
-        if len(self) >= self._most:
-            self._memories.remove(min(self._memories, key=lambda memory: memory.new_voxels))
-        assert view.configuration is not None
-        self._memories.append(_RememberedView(view, view.configuration, self._robot, new_voxels, stated))
+        stated: the same view with the pose that the caller stated. stamp: when it was taken [s]. oldest:
+        views from before this time are dropped [s]."""
+        q = view.configuration
+        assert q is not None
+        self._memories.append(_RememberedView(view, q, self._robot, new_voxels, stated, stamp))
+        self._memories = [memory for memory in self._memories if memory.stamp >= oldest]
+        if len(self) > self._most:
+            self._memories.remove(min(self._memories[:-1], key=lambda memory: memory.new_voxels))
 
     def refine(self, refined: Callable[[DepthView], DepthView]) -> None:
         """Give the kept views their refined poses, if these are much better. refined: takes a view with the
@@ -291,8 +530,8 @@ class ViewMemory:
         return merged([memory.volume for memory in self._memories])
 
     def points(self, free: Voxels) -> tuple[Points, PointErrors]:
-        """For each cell of a grid, the mean over the kept views that have a point there (see `seen_points`)
-        of these points [m]; and the errors of each mean, see `point_errors`.
+        """The mean of the kept views' points in each cell of a grid, where a view has one point (see
+        `seen_points`) [m]; and the errors of each mean, the largest of its points (see `point_errors`).
 
         Stray points are left out: points in free voxels of the map (`free`), through which other views saw,
         and, in noisy images, points of a single view without another point nearby, because a surface gives
@@ -306,6 +545,8 @@ class ViewMemory:
         np.maximum.at(errors, cell, np.concatenate([memory.errors for memory in self._memories]))
         stray = MAP.hold(free, points)
         if any(filtered(memory.view).spread for memory in self._memories):
+            from scipy.spatial import KDTree  # plans do without it
+
             once = counts == 1
             distances, _ = KDTree(points).query(points[once], k=2, distance_upper_bound=ALONE_DISTANCE)
             stray[once] |= np.isinf(distances[:, 1])

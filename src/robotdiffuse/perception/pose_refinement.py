@@ -1,9 +1,12 @@
-"""Refines inexact camera poses by what the cameras see: the arm, known shapes, and surfaces that several
-images show.
+"""Camera poses from what the cameras see: a fixed camera's pose from views of the arm, and the refinement of
+inexact poses by the arm, known shapes, and surfaces that several images show.
 
-Points are matched with the nearest point of a surface, along its normal, as in `camera_calibration`. The
-unknowns are the error of each camera's pose, which is constant in the camera's frame, and the distance
-between the arm's surface and its model. The stated `pose_deviation` serves as the prior.
+Each point is matched with the nearest point of a surface; its error is their distance along the surface's
+normal (Y. Chen and G. Medioni, "Object modelling by registration of multiple range images", 1992). In the
+estimate from views of the arm, errors are weighted by Geman and McClure's function, whose width shrinks from
+round to round. In the refinement, the unknowns are the error of each camera's pose, which is constant in the
+camera's frame, and the distance between the arm's surface and its model; the stated `pose_deviation` serves
+as the prior.
 """
 
 from collections.abc import Iterator, Sequence
@@ -11,23 +14,177 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from robotdiffuse.core.errors import InputError, check_list
 from robotdiffuse.core.transforms import placed, transform
-from robotdiffuse.core.types import Configuration, Points, Pose, Values
-from robotdiffuse.perception.camera_calibration import arm_surface, neighborhoods
+from robotdiffuse.core.types import Configuration, Mask, Points, Pose, Values
+from robotdiffuse.perception.camera_check import (
+    BETTER,
+    MIN_CELLS,
+    MIN_NAMED,
+    STEP_ANGLE,
+    agreement,
+    mistakes,
+)
 from robotdiffuse.perception.depth_filter import filtered, grown_for_errors, pose_error
 from robotdiffuse.perception.depth_view import DepthView, unprojected
 from robotdiffuse.perception.seen_points import ARM_DISTANCE, nearest_surfaces, sphere_distances
+from robotdiffuse.perception.visibility import surface_balls
 from robotdiffuse.perception.voxel_grid import MAP
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, check_robot
 from robotdiffuse.scenes.scene import Scene
+
+ARM_GATES = np.geomspace(0.15, 0.012, 25)
+"""For each round of the estimate, the distance beyond which points are too far from the arm to count [m]."""
+MIN_POINTS = 1500
+"""Every k-th of a view's points near the arm is used, with the largest k that leaves at least this many."""
+MODEL_CELL = 0.01
+"""One point of the arm's surface is used in each cubic cell with this edge [m]."""
+ARM_NEIGHBORS = 10
+"""Number of neighboring points of the surface from which a normal is estimated."""
+ARM_POINTS_PER_ERROR = 25
+"""Number of points that count as one independent measurement in the covariance, because the errors of
+neighboring points are correlated."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCalibration:
+    """The pose of a camera, estimated from views of the arm."""
+
+    T_base_camera: Pose
+    covariance: Float[ndarray, "6 6"]
+    """Covariance of the camera's position [m] and rotation vector [rad], in the base frame."""
+    agreement: float
+    """Fraction of the image cells in which the measured depth agrees with the model's, among those in which
+    the model is visible."""
+
+    @property
+    def pose_deviation(self) -> tuple[float, float]:
+        """Twice the standard deviation of the position [m] and of the angle [rad], for
+        `DepthView.pose_deviation`."""
+        position, angle = (
+            2 * float(np.sqrt(np.trace(self.covariance[i : i + 3, i : i + 3]))) for i in (0, 3)
+        )
+        return position, angle
+
+
+def calibrate_camera(views: Sequence[DepthView], robot: Robot) -> CameraCalibration:
+    """Estimate the pose of a fixed camera from views of the arm in several configurations.
+
+    Args:
+        views: Depth images of one camera, each with the arm's configuration. The estimate begins at their
+            `T_base_camera`, which must be within about 10 cm and 5 degrees of the true pose. It may also
+            contain one of the usual mistakes (an inverse, the axes of OpenGL, ...), which is undone first.
+        robot: The robot in the images.
+
+    Returns:
+        The pose, its covariance, and how well the images agree with it.
+
+    Raises:
+        InputError: If there are no views, if they differ in `T_base_camera`, if one lacks a configuration, if
+            the arm is hardly seen, or if no pose nearby agrees with the images.
+
+    Example:
+        ```python
+        calibration = rd.calibrate_camera(views, robot)
+        view = rd.DepthView(image, K, calibration.T_base_camera, pose_deviation=calibration.pose_deviation)
+        ```
+    """
+    check_robot(robot)
+    check_list("views", views, DepthView, "rd.DepthView", least=1)
+    each = [(view, q) for view in views if (q := view.configuration) is not None and len(q) == robot.dof]
+    if len(each) < len(views):
+        raise InputError(
+            f"{len(each)} of {len(views)} views have a configuration of {robot.name}'s {robot.dof} joints; "
+            "calibrate_camera needs one for each"
+        )
+    first, q = each[0]
+    if any(not np.allclose(view.T_base_camera, first.T_base_camera) for view in views):
+        raise InputError("views differ in T_base_camera; calibrate_camera takes views of one fixed camera")
+    # mistakes in the intrinsics are left alone: the estimate is of the pose only
+    candidates = [first, *(view for _, view in mistakes(first) if view.intrinsics == first.intrinsics)]
+    scores = [s * (count >= MIN_CELLS) for s, _, count in (agreement(v, robot, q) for v in candidates)]
+    best = int(np.argmax(scores))
+    T = candidates[best if scores[best] > BETTER * scores[0] else 0].T_base_camera
+    models = [arm_surface(robot, q) for _, q in each]
+    points = [_near_arm(view, T, tree) for (view, _), (tree, _, _) in zip(each, models, strict=True)]
+    hessian = np.eye(6)
+    spread = 0.0
+    # Gauss-Newton steps: A is the Jacobian of the errors e with respect to the camera's position and rotation
+    for gate in ARM_GATES:
+        rows = list[ndarray]()
+        errors = list[ndarray]()
+        for (tree, surface, normals), in_camera in zip(models, points, strict=True):
+            at = placed(T, in_camera)
+            distance, near = map(np.asarray, tree.query(at, distance_upper_bound=gate))
+            close = np.flatnonzero(np.isfinite(distance))
+            normal = normals[near[close]]
+            rows.append(np.hstack([normal, np.cross(at[close] - T[:3, 3], normal)]))
+            errors.append((normal * (at[close] - surface[near[close]])).sum(axis=1))
+        A = np.concatenate(rows)
+        e = np.concatenate(errors)
+        if len(e) < MIN_CELLS:
+            raise InputError(
+                f"the arm is hardly seen: {len(e)} points of the views are near it, at least {MIN_CELLS} are "
+                "needed; set T_base_camera of the views closer to the true pose, or bring the arm into view"
+            )
+        weights = 1 / (1 + (e / (0.3 * gate)) ** 2) ** 2
+        hessian = (A * weights[:, None]).T @ A + 1e-9 * np.eye(6)
+        spread = float(np.sqrt((weights * e**2).sum() / weights.sum()))
+        change = -np.linalg.solve(hessian, A.T @ (weights * e))
+        turn = Rotation.from_rotvec(change[3:]).as_matrix()
+        T = transform(T[:3, 3] + change[:3], turn @ T[:3, :3])
+    shares = [agreement(replace(view, T_base_camera=T), robot, q) for view, q in each]
+    total = sum(count for _, _, count in shares)
+    agrees = sum(share * count for share, _, count in shares) / max(total, 1)
+    if agrees < MIN_NAMED:
+        raise InputError(
+            f"no pose near T_base_camera agrees with the images: the best explains {100 * agrees:.0f} % of "
+            "the arm's depths; set T_base_camera of the views closer to the true pose, or check the "
+            "intrinsics and the joint positions"
+        )
+    return CameraCalibration(T, ARM_POINTS_PER_ERROR * spread**2 * np.linalg.inv(hessian), agrees)
+
+
+def arm_surface(robot: Robot, q: Configuration) -> tuple[KDTree, Points, Points]:
+    """Points on the arm's surface at a configuration, as a tree and an array [m], and the normals there."""
+    centers = surface_balls(robot, q).astype(np.float64)
+    points = centers[np.unique(np.floor(centers / MODEL_CELL), axis=0, return_index=True)[1]]
+    tree = KDTree(points)
+    return tree, points, neighborhoods(points, tree, ARM_NEIGHBORS)[1][:, :, 0]
+
+
+def neighborhoods(points: Points, tree: KDTree, count: int) -> tuple[Points, Float[ndarray, "n 3 3"]]:
+    """Extents and principal axes of the `count` points nearest to each point.
+
+    Returns the squared extents [n, 3] along the axes, the smallest first, and the axes as the columns of n
+    matrices. If the points lie on a surface, the first axis is its normal.
+    """
+    around = points[tree.query(points, k=count)[1]]
+    off = around - around.mean(axis=1, keepdims=True)
+    sizes, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))
+    return sizes, axes
+
+
+def _near_arm(view: DepthView, T: Pose, tree: KDTree) -> Points:
+    """Points of an image that may be on the arm if the camera is at about T, in the camera's frame [m]."""
+    stride = max(1, round(STEP_ANGLE * view.intrinsics[0] / 2))
+    intrinsics = np.divide(view.intrinsics, stride)
+    points = DepthView(view.depth[::stride, ::stride], intrinsics, np.eye(4)).points()
+    distance, _ = tree.query(placed(T, points), distance_upper_bound=2 * ARM_GATES[0])
+    points = points[np.isfinite(distance)]
+    return points[:: max(1, len(points) // MIN_POINTS)]
+
 
 MAX_VIEWS = 8
 """Maximum number of images by which the pose of one camera is refined."""
+MAX_CAMERAS = 8
+"""Maximum number of cameras whose poses are refined. A camera that moves beside the arm counts as a new one
+at each of its poses."""
 MIN_TURN = 0.1
 """An image is used only if a joint of the arm differs by more than this from each earlier image [rad]."""
 COLUMNS = 80
@@ -115,8 +272,6 @@ class _Image:
     T: Pose
     """T_base_camera as the view states it."""
     configuration: Configuration
-    shows_scene: bool
-    """Whether points of the scene are used; for a camera beside the arm, only in its first image."""
     points: Points
     """Points in the camera's frame [m]."""
     normals: Points
@@ -125,7 +280,7 @@ class _Image:
     """Standard deviations of the points' depths [m]."""
     shift: Values
     """How far the stated error of the pose may displace each point [m]."""
-    arm: Bool[ndarray, "n"]
+    arm: Mask
     """Which points are on the arm; they are matched with the arm's surface."""
     surface: tuple[KDTree, Points, Points] | None
     """The arm's surface, see `arm_surface`; None without points on the arm."""
@@ -146,9 +301,9 @@ class PoseRefinement:
     def observe(self, view: DepthView) -> DepthView:
         """Take a view into account, and return it with its refined pose."""
         q = view.configuration
-        if not any(view.pose_deviation) or view.cloud is not None or q is None:
+        number = self._camera(view)
+        if number is None or q is None:  # `_camera` returns None if q is None; this is for type checkers
             return view
-        number = self._camera(view, q)
         earlier = [image for image in self._images if image.camera == number]
         if len(earlier) < MAX_VIEWS and all(np.abs(s.configuration - q).max() > MIN_TURN for s in earlier):
             shows_scene = self._cameras[number].link is not None or not earlier
@@ -161,24 +316,30 @@ class PoseRefinement:
     def refined(self, view: DepthView) -> DepthView:
         """The view with the pose and the deviation estimated from all views so far. It is returned unchanged
         if the estimate is implausible."""
-        q = view.configuration
-        if not any(view.pose_deviation) or view.cloud is not None or q is None:
+        number = self._camera(view)
+        if number is None:
             return view
-        camera = self._cameras[self._camera(view, q)]
+        camera = self._cameras[number]
         sizes = np.linalg.norm(camera.error.reshape(2, 3), axis=1)
         if (sizes > IMPLAUSIBLE * np.array(view.pose_deviation)).any():
             return view
         T = view.T_base_camera @ _pose(camera.error)
         return replace(view, T_base_camera=T, pose_deviation=_deviation(view, T, camera.covariance))
 
-    def _camera(self, view: DepthView, q: Configuration) -> int:
-        """The index of a view's camera, which is added if it is new."""
+    def _camera(self, view: DepthView) -> int | None:
+        """The index of a view's camera, which is added if it is new. None if there are MAX_CAMERAS others, or
+        if the view states no error of its pose, is of a cloud or lacks the configuration."""
+        q = view.configuration
+        if not any(view.pose_deviation) or view.cloud is not None or q is None:
+            return None
         T = view.T_base_camera
         for number, camera in enumerate(self._cameras):
             if camera.link is None and np.allclose(T, camera.T):
                 return number
             if camera.link is not None and is_on(self._robot, camera.link, camera.T, T, q):
                 return number
+        if len(self._cameras) == MAX_CAMERAS:
+            return None
         stated = np.repeat(np.maximum(view.pose_deviation, 1e-5), 3) / PRIOR_DEVIATIONS
         link, nominal = next((mount for mount in self._on_arm if is_on(self._robot, *mount, T, q)), (None, T))
         camera = _Camera(link, nominal, stated, np.zeros(6), np.diag(stated**2))
@@ -192,8 +353,7 @@ class PoseRefinement:
         spread = filtered(view).spread
         spheres = grown_for_errors(self._robot.placed_spheres(q), view).astype(np.float32)
         on_arm = sphere_distances(placed(T, points), spheres) < ARM_DISTANCE
-        beside_arm = self._cameras[camera].link is None
-        arm = on_arm if beside_arm else np.zeros(len(points), np.bool_)
+        arm = on_arm if self._cameras[camera].link is None else np.zeros(len(points), np.bool_)
         use = np.zeros(len(points), np.bool_)
         for usable in (arm, flat & ~on_arm & shows_scene):
             at = np.flatnonzero(usable)
@@ -202,7 +362,7 @@ class PoseRefinement:
         noise = spread * points[:, 2] ** 2
         shift = pose_error(view, np.linalg.norm(points, axis=1))
         surface = arm_surface(self._robot, q) if arm.any() else None
-        return _Image(camera, T, q, shows_scene, points, normals[use], noise, shift, arm[use], surface)
+        return _Image(camera, T, q, points, normals[use], noise, shift, arm[use], surface)
 
     def _fit(self) -> None:
         """Estimate the errors of all poses from all images by Gauss-Newton steps.
@@ -300,7 +460,7 @@ def is_on(robot: Robot, link: str, nominal: Pose, T: Pose, q: Configuration) -> 
     return bool(np.abs(T - robot.fk(q, link) @ nominal).max() < SAME_CAMERA)
 
 
-def _selected(match: _Match, ok: Bool[ndarray, "n"]) -> _Match:
+def _selected(match: _Match, ok: Mask) -> _Match:
     """The rows of a match that are `ok` and whose distances are within their limits."""
     ok = ok & (np.abs(match.distances) < match.limits)
     return _Match(*(values[ok] for values in match))
@@ -351,7 +511,7 @@ def _block_points(view: DepthView) -> Points:
     return unprojected(view, size * u + half, size * v + half, z)
 
 
-def _normals(points: Points) -> tuple[Points, Bool[ndarray, "n"]]:
+def _normals(points: Points) -> tuple[Points, Mask]:
     """The normals at points in the camera's frame, towards the camera; and which points are on a flat
     surface."""
     if len(points) <= NEIGHBORS:

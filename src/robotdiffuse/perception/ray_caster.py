@@ -20,6 +20,7 @@ from robotdiffuse.scenes.shapes import PointCloud, Triangulated
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
+# Surfaces nearer to the camera than this are not rendered [m].
 _NEAR = np.float32(0.02)
 _MISS = np.float32(1e9)
 
@@ -43,6 +44,8 @@ def rectangle(x, y, z, r, intrinsics, h, w):
         return 0, -1, 0, -1
     near = max(z - r, _NEAR)
     far = z + r
+    # each edge is projected at the depth that makes the rectangle larger: at the near depth if it is on its
+    # own side of the image's center, else at the far depth
     left = (x - r) / (near if x < r else far)
     right = (x + r) / (near if x > -r else far)
     top = (y - r) / (near if y < r else far)

@@ -21,7 +21,8 @@ SAME_SURFACE_PIXELS = np.float32(4.0)
 """Neighboring pixels are on the same surface if their depths differ by less than this many widths of a pixel
 at that depth, or by less than SAME_SURFACE_FRACTION."""
 SAME_SURFACE_FRACTION = np.float32(0.01)
-"""As a fraction of the depth; see SAME_SURFACE_PIXELS."""
+"""Largest difference of two depths on the same surface, as a fraction of the depth; see
+SAME_SURFACE_PIXELS."""
 MAX_DEPTH = np.float32(1e6)
 """Larger depths are no returns [m]."""
 _NEAREST = np.float32(NEAREST)
@@ -326,8 +327,8 @@ def point_shapes(
 
     Two kinds of points are left out because their errors may have displaced them. Points of the first kind
     are less than MIN_POINT_RADIUS outside the arm at start or goals, or inside it by at most the error of the
-    pose plus END_SPREADS times the noise. Points of the second kind are nearer to a known shape than
-    KNOWN_DISTANCE plus the error of the pose plus the noise.
+    pose plus END_SPREADS times the noise; there are none if both are 0. Points of the second kind are nearer
+    to a known shape than KNOWN_DISTANCE plus the error of the pose plus the noise.
 
     errors: see `point_errors`. enlarged: whether the error of the pose is added to the radius.
     """

@@ -1,5 +1,5 @@
-"""What a camera would see from a pose: the voxels that neither the arm nor other voxels hide; and which of
-the small balls that would cover the arm's surface at a goal an image shows to be empty."""
+"""What a camera would see from a pose: the voxels that neither the arm nor other voxels hide. Also, which
+balls an image shows to be empty; these balls cover the arm's surface at a goal."""
 
 from itertools import product
 
@@ -129,8 +129,8 @@ def seen_share(
 
 @kernel(nogil=True)
 def _place(robot, q, margin, frames, arm):
-    """Writes the arm's covering spheres at a configuration, inflated by `margin`, to `arm`, rows of
-    `SceneArrays.solids`. frames: working memory."""
+    """Writes the arm's covering spheres at a configuration, inflated by `margin`, to `arm`, whose rows have
+    the form of those of `SceneArrays.solids`. frames: working memory."""
     frames_of(robot, q, frames)
     for g in range(len(robot.frame)):
         for s in range(robot.first[g], robot.first[g + 1]):
@@ -177,6 +177,7 @@ def see_through(depth, intrinsics, T, balls, radius, errors, border, seen):
         v1 = np.ceil(fy * (y + grown) / (near if y > -grown else far) + cy) + border
         if u0 < _ZERO or v0 < _ZERO or u1 > np.float32(w - 1) or v1 > np.float32(h - 1):
             continue
+        # at most half of MAX_DEPTH, the depth of pixels with nothing in range: these are behind every ball
         min_return = min(far + errors[2] * far * far, MAX_DEPTH * _HALF)
         seen[n] = _all_behind(raw, int(v0), int(v1), int(u0), int(u1), min_return)
 
