@@ -161,3 +161,12 @@ def test_what_is_wrong_is_named(tmp_path: Path) -> None:
     ):
         refuses(message, rd.write_dataset, paths, around, tmp_path / "own")
     assert not (tmp_path / "own" / "manifest.json").exists()
+
+
+def test_joint_names_and_contacts_of_motions_are_not_dropped(tmp_path: Path) -> None:
+    scene = rd.Scene([rd.Box(PANDA.fk(GOAL)[:3, 3], [0.05, 0.05, 0.05], name="part")], allowed_contacts={"part": "all"})
+    path = rd.Path(rd.load_robot("gen3").joint_names, np.stack([START, GOAL]))
+    refuses(r"paths\[0\].joint_names is joint_1", rd.write_dataset, [path] * 3, scene, tmp_path / "own", PANDA)
+    refuses("allowed_contacts with part", rd.write_dataset, [[START, GOAL]], scene, tmp_path / "own", PANDA)
+    np.savez(tmp_path / "robot.npz", x_train=np.float32(1), y_train=np.zeros((1, 23), np.float32))
+    refuses("x_train has shape", import_npz, tmp_path / "robot.npz", tmp_path / "set")

@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import fields, replace
+from inspect import unwrap
 
 import numpy as np
 import pytest
@@ -181,3 +182,8 @@ def test_clouds_are_float32_whatever_the_default_type_of_pytorch_is(store):
         torch.testing.assert_close(RopDataset(store, "train", points=8)[0]["points"], expected, atol=0, rtol=0)
     finally:
         torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.parametrize("wrong", [{"points": 1.5}, {"waypoints": 3.5}, {"seed": 2**70}, {"device": "foo"}])
+def test_arguments_of_the_wrong_type_are_named(store, wrong) -> None:
+    refuses(next(iter(wrong)), unwrap(RopDataset.__init__), object.__new__(RopDataset), store, **wrong)

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import signal
 import sys
 from dataclasses import replace
 
@@ -91,6 +92,17 @@ def test_a_full_disk(tmp_path, arrays):
             shards.write_shard(tmp_path, index, arrays, {})
     assert contents(tmp_path) == before
     assert [p.name for p in tmp_path.iterdir()] == ["shard_00000.zarr"]
+
+
+def test_ctrl_c_waits_for_a_shard(tmp_path, arrays, monkeypatch):
+    """Regression: within a call of zarr it left coroutines behind, which warned at the exit."""
+    path = shards.shard_path
+    monkeypatch.setattr(shards, "shard_path", lambda *of: signal.raise_signal(signal.SIGINT) or path(*of))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs ignore it
+    with pytest.raises(KeyboardInterrupt):
+        shards.write_shard(tmp_path, 0, arrays, {})
+    signal.signal(signal.SIGINT, before)
+    assert shards.shard_indices(tmp_path) == [0]
 
 
 @later

@@ -22,14 +22,21 @@ from robotdiffuse.core import registry
 from robotdiffuse.evaluation import bench
 from robotdiffuse.evaluation.bench_comparisons import LATE_SECONDS
 from robotdiffuse.evaluation.metrics import METRICS
-from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name, validator
-from robotdiffuse.evaluation.runs import Record, RecordFile, Run, read_records, record_path
+from robotdiffuse.evaluation.runs import (
+    Record,
+    RecordFile,
+    Run,
+    gather_cases,
+    problem_set_name,
+    read_records,
+    record_path,
+    validator,
+)
 from robotdiffuse.learning.weight_files import BUNDLED
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.planning.diffusion import Diffusion
 from robotdiffuse.planning.search.rrt import AORRTCSettings, RRTConnect
-from robotdiffuse.problems.files import problem_record
-from robotdiffuse.problems.held_out import held_out_problem, line_length
+from robotdiffuse.problems.files import held_out_problem, line_length, problem_record
 
 RECORD = Record("rrt_connect", "rop", "rop/0", "rop", False, 0, 1.0, "solved", "", 0.01, progress=((0.01, 2.0),))
 

@@ -15,10 +15,9 @@ from helpers.refusals import refuses
 from robotdiffuse.core.tables import Table
 from robotdiffuse.evaluation import bench_comparisons, bench_report
 from robotdiffuse.evaluation.metrics import METRICS, Metric, measured
-from robotdiffuse.evaluation.problem_sets import case_file
 from robotdiffuse.evaluation.report import draw_plot
-from robotdiffuse.evaluation.runs import RESTARTED, Record, record_of_row, record_path
-from robotdiffuse.problems.held_out import Case, held_out_problem
+from robotdiffuse.evaluation.runs import RESTARTED, Record, case_file, record_of_row, record_path
+from robotdiffuse.problems.files import Case, held_out_problem
 
 RUN = {"date": "2026-01-02 03:04", "processor": "Abacus_9 & sons", "cores": 4, "python": "3.12", "versions": {"numpy": "2.0"}}
 RUN |= {"workers": 1, "problems": ["rop"], "seeds": 3}

@@ -12,7 +12,7 @@ import robotdiffuse as rd
 from helpers.example_robots import planar_arm
 from helpers.panda import HOME, PANDA
 from robotdiffuse.core.transforms import rotation_about, transform
-from robotdiffuse.evaluation import metrics, statistics
+from robotdiffuse.evaluation import bench_comparisons, metrics
 from robotdiffuse.evaluation.paper import PAPER_TABLE_1
 from robotdiffuse.validation.validator import VerifySettings
 
@@ -136,19 +136,16 @@ def test_one_centimeter_and_fifteen_degrees_are_settings(shift: float, angle: fl
         assert ("" if violation is None else violation.kind) == expected
 
 
-def test_wilson_interval() -> None:
+def test_intervals_are_wilsons_and_have_the_normal_width() -> None:
     """R. G. Newcombe 1998, table 1, method 3."""
     table = (81, 263, 0.2553, 0.3662), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718), (0, 0, 0.0, 1.0)
     for successes, n, low, high in table:
-        assert statistics.wilson_interval(successes, n) == pytest.approx((low, high), abs=5e-5)
-
-
-def test_bootstrap_of_the_mean_has_the_normal_width() -> None:
+        assert bench_comparisons.wilson_interval(successes, n) == pytest.approx((low, high), abs=5e-5)
     values = np.random.default_rng(1).normal(3.0, 2.0, 400)
-    low, high = statistics.bootstrap_interval(values)
+    low, high = bench_comparisons.bootstrap_interval(values)
     half = 1.96 * values.std() / 20
     assert (low, high) == pytest.approx((values.mean() - half, values.mean() + half), abs=0.02)
-    assert statistics.bootstrap_interval(values) == (low, high)
+    assert bench_comparisons.bootstrap_interval(values) == (low, high)
 
 
 def test_paired_success_is_the_exact_test_of_mcnemar() -> None:
@@ -156,7 +153,7 @@ def test_paired_success_is_the_exact_test_of_mcnemar() -> None:
     b = np.full(100, np.nan)
     a[:80] = b[:80] = 2.0
     b[80:85] = a[85:97] = 2.0
-    found = statistics.compare(a, b)
+    found = bench_comparisons.compare(a, b)
     assert (found.a_only, found.b_only, found.both, found.neither) == (12, 5, 80, 3)
     assert found.p_success == pytest.approx(2 * sum(comb(17, k) for k in range(6)) / 2**17)
     assert (found.ratio, found.ratio_interval, found.p_length) == (1.0, (1.0, 1.0), 1.0)
@@ -166,29 +163,29 @@ def test_paired_lengths_are_the_signed_ranks_of_wilcoxon() -> None:
     """C. Darwin's maize data: rank sums 24 and 96; 1,352 of the 2^15 sign patterns are at least as extreme."""
     differences = np.array([6, 8, 14, 16, 23, 24, 28, 29, 41, -48, 49, 56, 60, -67, 75])
     lengths = np.random.default_rng(0).uniform(1, 9, 15)
-    found = statistics.compare(lengths * np.exp(differences / 1000), lengths)
+    found = bench_comparisons.compare(lengths * np.exp(differences / 1000), lengths)
     assert found.p_length == pytest.approx(0.041259765625)
     assert found.ratio == pytest.approx(np.exp(0.024))
     assert found.ratio is not None and found.ratio_interval is not None
     assert np.exp(0.006) <= found.ratio_interval[0] < found.ratio < found.ratio_interval[1] <= np.exp(0.056)
-    back = statistics.compare(lengths, lengths * np.exp(differences / 1000))
+    back = bench_comparisons.compare(lengths, lengths * np.exp(differences / 1000))
     assert back.p_length == found.p_length
     assert back.ratio == pytest.approx(np.exp(-0.024))
-    assert statistics.compare(np.full(6, 1.1), np.full(6, 1.0)).p_length == pytest.approx(2 / 2**6)
+    assert bench_comparisons.compare(np.full(6, 1.1), np.full(6, 1.0)).p_length == pytest.approx(2 / 2**6)
 
 
 def test_paired_without_common_solutions() -> None:
-    found = statistics.compare(np.array([1.0, np.nan, np.nan]), np.array([np.nan, 1.0, np.nan]))
+    found = bench_comparisons.compare(np.array([1.0, np.nan, np.nan]), np.array([np.nan, 1.0, np.nan]))
     assert (found.a_only, found.b_only, found.both, found.neither) == (1, 1, 0, 1)
     assert (found.p_success, found.ratio, found.ratio_interval, found.p_length) == (1.0, None, None, 1.0)
-    none = statistics.compare(np.zeros(0), np.zeros(0))
+    none = bench_comparisons.compare(np.zeros(0), np.zeros(0))
     assert (none.neither, none.p_success, none.ratio) == (0, 1.0, None)
-    still = statistics.compare(np.zeros(3), np.zeros(3))  # start and goal are the same
+    still = bench_comparisons.compare(np.zeros(3), np.zeros(3))  # start and goal are the same
     assert (still.ratio, still.p_length) == (1.0, 1.0)
 
 
 def test_comscore_of_the_papers_table() -> None:
-    scores = statistics.comscores([row.indicators for row in PAPER_TABLE_1])
+    scores = bench_comparisons.comscores([row.indicators for row in PAPER_TABLE_1])
     by_hand = [
         (0 + 1 + (18.492 - 15.037) / 4.35 + 0) / 4,
         (11.2 / 14.1 + 0 + 0 + 0) / 4,
@@ -201,12 +198,12 @@ def test_comscore_of_the_papers_table() -> None:
 
 
 def test_where_all_are_equal_all_are_best() -> None:
-    same = statistics.Indicators(90.0, 0.0, 5.0, 1.0)
-    np.testing.assert_array_equal(statistics.comscores([same, same]), [1.0, 1.0])
-    np.testing.assert_array_equal(statistics.comscores([same, replace(same, length=6.0)]), [1.0, 0.75])
-    assert statistics.comscores([]).shape == (0,)
+    same = bench_comparisons.Indicators(90.0, 0.0, 5.0, 1.0)
+    np.testing.assert_array_equal(bench_comparisons.comscores([same, same]), [1.0, 1.0])
+    np.testing.assert_array_equal(bench_comparisons.comscores([same, replace(same, length=6.0)]), [1.0, 0.75])
+    assert bench_comparisons.comscores([]).shape == (0,)
     # unknown figures count as the worst
-    nothing = statistics.Indicators(0.0, 0.0, np.nan, 10.0)
-    rows = [statistics.Indicators(90.0, 2.0, 5.0, 1.0), statistics.Indicators(95.0, 1.0, 7.0, 3.0), nothing]
-    np.testing.assert_allclose(statistics.normalized(rows), [[90 / 95, 0, 1, 1], [1, 0.5, 0, 7 / 9], [0, 1, 0, 0]])
-    np.testing.assert_array_equal(statistics.normalized([nothing, nothing])[:, 2], [0, 0])
+    nothing = bench_comparisons.Indicators(0.0, 0.0, np.nan, 10.0)
+    rows = [bench_comparisons.Indicators(90.0, 2.0, 5.0, 1.0), bench_comparisons.Indicators(95.0, 1.0, 7.0, 3.0), nothing]
+    np.testing.assert_allclose(bench_comparisons.normalized(rows), [[90 / 95, 0, 1, 1], [1, 0.5, 0, 7 / 9], [0, 1, 0, 0]])
+    np.testing.assert_array_equal(bench_comparisons.normalized([nothing, nothing])[:, 2], [0, 0])

@@ -12,8 +12,8 @@ from helpers.commands import Said
 from helpers.refusals import refuses
 from robotdiffuse.cli import main
 from robotdiffuse.evaluation import ablation, paper
+from robotdiffuse.evaluation.bench_comparisons import Indicators, comscores
 from robotdiffuse.evaluation.runs import read_records
-from robotdiffuse.evaluation.statistics import Indicators, comscores
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.encoders import ENCODERS, make_encoder
 from robotdiffuse.learning.motion_model import MotionModelSettings
@@ -21,7 +21,7 @@ from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.training.config import CONFIGS, planner_training
 from robotdiffuse.learning.training.tasks import model_settings
 from robotdiffuse.learning.weight_files import BUNDLED, FORMAT, RobotIdentity
-from robotdiffuse.problems.held_out import CaseFile
+from robotdiffuse.problems.files import CaseFile
 from robotdiffuse.validation.tolerances import goal_error
 
 ROW_NAMES = {row.paper: row.name for row in paper.ROWS if row.paper}
@@ -86,7 +86,7 @@ def test_a_small_page_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert main(command) == 0 and main(command) == 0
     assert [len(records) for records in read_records(tmp_path).values()] == [6, 6]
     page = (tmp_path / "table1.md").read_text()
-    assert "Goal: a pose with ten configurations; 3 nontrivial problems" in page
+    assert "Goal: a pose with ten configurations; 3 non-trivial problems" in page
     assert "Trivial problems, in which the straight line" in page
     assert "| nearest" in page and "14.218" in page
 

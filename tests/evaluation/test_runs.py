@@ -12,7 +12,7 @@ from helpers.panda import GOAL, PANDA, START
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.evaluation.runs import Fields, Record, Run, planned, restarted, run_all, sampled
 from robotdiffuse.planning.search.rrt import RRTConnect
-from robotdiffuse.problems.held_out import Case
+from robotdiffuse.problems.files import Case
 
 FREE = rd.Problem(PANDA, rd.Scene([]), START, rd.JointGoal(GOAL[None]))
 BLOCKED = rd.Problem(PANDA, rd.Scene([rd.Sphere([0.5, 0.0, 0.5], 0.2)]), START, rd.JointGoal(GOAL[None]))
@@ -64,8 +64,7 @@ def test_what_is_kept_is_not_made_again_but_for_other_limits(tmp_path: Path) -> 
 
 def test_samples_are_validated_as_they_are_and_the_shortest_that_passes_is_measured() -> None:
     def draw(run: Run, checker: CollisionChecker) -> np.ndarray:
-        middle = (START + GOAL) / 2
-        bent = [np.stack([START, middle + np.array([0, 0, bend, 0, 0, 0, 0.0]), GOAL]) for bend in (0.4, 0.2)]
+        bent = [np.stack([START, (START + GOAL) / 2 + np.array([0, 0, bend, 0, 0, 0, 0.0]), GOAL]) for bend in (0.4, 0.2)]
         bent[1][[0, -1]] += 0.01
         return np.stack([bent[0], bent[1], np.stack([START, START + 20.0, GOAL])]).astype(np.float32)
 

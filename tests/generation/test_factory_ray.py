@@ -16,7 +16,7 @@ from robotdiffuse.evaluation.bench import BenchSettings, run_bench
 from robotdiffuse.evaluation.runs import read_records
 from robotdiffuse.generation import GenerationSettings, factory, generate
 from robotdiffuse.planning import load_planner, plan_many
-from robotdiffuse.problems.held_out import held_out_problem
+from robotdiffuse.problems.files import held_out_problem
 
 # read when ray is imported: no telemetry, and no pages of logs when a node is lost
 os.environ["RAY_USAGE_STATS_ENABLED"] = "0"

@@ -57,17 +57,13 @@ def test_training_begins_with_the_weights_that_it_is_given() -> None:
     refuses(r"families.*rap.*crate", replace, TINY, families=("rap",))
 
 
-def test_voxels_pack_and_unpack() -> None:
+def test_packing_and_folding_of_voxels_are_undone() -> None:
     fine = voxels_within(load_family("table").scene(np.random.default_rng(0)), FINE)
     bits = completion.unpack_fine(completion.pack_fine(fine))
     for place in np.argwhere(bits.any(axis=-1))[::97]:
         for bit in range(8):
-            offset = (bit >> 2, bit >> 1 & 1, bit & 1)
-            assert bits[(*place, bit)] == fine[tuple(2 * place + offset)]
+            assert bits[(*place, bit)] == fine[tuple(2 * place + (bit >> 2, bit >> 1 & 1, bit & 1))]
     assert bits.sum() == fine.sum()
-
-
-def test_folding_and_unfolding_are_inverse() -> None:
     x = torch.arange(8 * 12 * 4 * 2).reshape(2, 8, 12, 4)
     assert (unfolded(folded(x))[..., 0] == x).all()
     assert folded(x)[1, 2, 3, 1].tolist() == x[1, 4:6, 6:8, 2:4].ravel().tolist()
@@ -129,8 +125,7 @@ def test_training_is_resumed_exactly_with_and_without_prefetching(tmp_path: Path
         if number == 1:  # regression: the death of a worker ended the training without a checkpoint
             multiprocessing.active_children()[-1].kill()
         a = ahead.next(rng)
-        b = alone.next(other)
-        assert all((x == y).all() for x, y in zip(a, b, strict=True))
+        assert all((x == y).all() for x, y in zip(a, alone.next(other), strict=True))
     assert (ahead.next(np.random.default_rng(3)).seen == alone.next(np.random.default_rng(3)).seen).all()
     ahead.close()
 
@@ -163,8 +158,7 @@ def test_bundled_weights_are_better_than_a_constant(family: str) -> None:
     above = completion.voxel_centers()[..., 2] > 0.02
     p = [network(*volume) for volume in zip(samples.seen, samples.behind, strict=True)]
     counted = ((samples.seen & (completion.FREE | completion.OCCUPIED)) == 0) & completion.reachable() & above
-    stated = np.stack([completion.unpack_fine(completion.pack_fine(one > 0.1)) for one in p])
-    called = stated[counted]
+    called = np.stack([completion.unpack_fine(completion.pack_fine(one > 0.1)) for one in p])[counted]
     true = completion.unpack_fine(samples.truth)[counted]
     assert called[true].mean() > 0.4, "recall"
     assert true[called].mean() > 3 * true.mean(), "precision"

@@ -54,8 +54,7 @@ def inputs(waypoints: int = 12, batch: int = 2, seed: int = 1) -> tuple[torch.Te
 
 @pytest.mark.parametrize("name", denoisers.DENOISERS)
 def test_untrained_network_predicts_the_mean_trajectory(name):
-    network = denoisers.DENOISERS.load(name)(denoisers.DENOISERS.defaults(name), 48, DOF, FEATURES, CONDITION)
-    out = network(*inputs(48))
+    out = denoisers.DENOISERS.load(name)(denoisers.DENOISERS.defaults(name), 48, DOF, FEATURES, CONDITION)(*inputs(48))
     assert out.shape == (2, 48, DOF) and out.dtype == torch.float32
     assert not out.any()
 

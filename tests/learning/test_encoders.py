@@ -205,8 +205,7 @@ def test_training_alone(name, tmp_path, monkeypatch):
         assert sizes == {40}
     encoder = load_encoder(tmp_path / "long")
     assert encoders.encoder_name(encoder) == name
-    scenes = random_scenes(300, 12, np.random.default_rng(5))
-    z = encoder(scene_clouds(encoder, scenes, np.random.default_rng(6)))
+    z = encoder(scene_clouds(encoder, random_scenes(300, 12, np.random.default_rng(5)), np.random.default_rng(6)))
     torch.testing.assert_close(z.std(0), torch.ones(8), atol=0.35, rtol=0)
 
 

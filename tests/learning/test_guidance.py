@@ -124,8 +124,7 @@ def test_together_they_reach_a_free_and_short_path_that_none_reaches_alone() -> 
 
     def reached(settings: GuidanceSettings) -> tuple[bool, float]:
         moved, _ = CollisionGuidance(checker, settings)(line[None], 60)
-        bends = float((np.diff(moved[0], 2, axis=0) ** 2).sum())
-        return bool(checker.free(moved[0].astype(float)).all()), bends
+        return bool(checker.free(moved[0].astype(float)).all()), float((np.diff(moved[0], 2, axis=0) ** 2).sum())
 
     free, bent = reached(GuidanceSettings())
     assert free

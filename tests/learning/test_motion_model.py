@@ -160,8 +160,7 @@ def test_gradients_of_attention_in_bf16_are_those_in_fp32():
     for dtype in (torch.float32, torch.bfloat16):
         parts = inputs.to(dtype, copy=True).requires_grad_()
         q, k, v = parts.unbind(0)
-        loss = (attend(q, k, v).float() - target).square().mean()
-        gradients.append(torch.autograd.grad(loss, parts)[0].float())
+        gradients.append(torch.autograd.grad((attend(q, k, v).float() - target).square().mean(), parts)[0].float())
     assert (gradients[1] - gradients[0]).norm() < 1e-2 * gradients[0].norm()
 
 

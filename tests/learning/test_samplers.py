@@ -101,8 +101,7 @@ def their_steps(levels: list[int], scheduler, variance_noise: bool, **settings) 
     for timestep, level, noise in zip(scheduler.timesteps, levels[:-1], draws[1:], strict=True):
         if variance_noise:
             settings["variance_noise"] = noise
-        clean = torch.from_numpy(network(x.numpy(), level))
-        x = scheduler.step(clean, timestep, x, **settings).prev_sample.double()
+        x = scheduler.step(torch.from_numpy(network(x.numpy(), level)), timestep, x, **settings).prev_sample.double()
         found.append(x.numpy())
     return np.array(found)
 

@@ -1,5 +1,6 @@
 """Worker processes are replaced when they die, and do not outlive their parent."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -35,12 +36,15 @@ def test_a_single_worker_is_replaced_when_it_dies_or_is_ended(worker: Worker) ->
     with pytest.raises(EndedError):
         worker.call(os.kill, first, signal.SIGKILL)
     second = worker.call(os.getpid)
-    worker.end(0.0)
+    os.kill(second, signal.SIGKILL)  # between two calls, such as when memory runs out
+    waiting.until(lambda: second not in [process.pid for process in multiprocessing.active_children()])
     third = worker.call(os.getpid)
-    assert len({first, second, third, os.getpid()}) == 4
+    worker.end(0.0)
+    fourth = worker.call(os.getpid)
+    assert len({first, second, third, fourth, os.getpid()}) == 5
     with ThreadPoolExecutor(1) as threads:
         sent = threads.submit(worker.call, time.sleep, HELD)
-        os.kill(third, signal.SIGTERM)
+        os.kill(fourth, signal.SIGTERM)
         with pytest.raises(EndedError, match="by SIGTERM"):
             sent.result(HELD)
     worker.close()
@@ -138,7 +142,7 @@ def test_errors_of_calls_keep_the_process(worker: Worker) -> None:
         worker.call(eval, "lambda: None")
     with pytest.raises(Exception, match="pickle"):
         worker.call(print, lambda: None)
-    with pytest.raises(TypeError):
+    with pytest.raises(RuntimeError, match="OddError: 1 and 2"):
         worker.call(odd)
     with pytest.raises(SystemExit):
         worker.call(sys.exit, "no license")
@@ -250,3 +254,13 @@ def test_a_process_that_cannot_start_is_said(worker: Worker, monkeypatch: pytest
         start.assert_called_once()
     monkeypatch.undo()
     assert worker.call(os.getpid) != os.getpid()
+
+
+def test_a_call_after_the_end_and_a_signal_without_a_name(worker: Worker) -> None:
+    """Regressions: the call waited forever; the signal was a ValueError."""
+    with Workers(1) as workers:
+        pass
+    with pytest.raises(EndedError, match="closed"):
+        workers.submit(abs, -3).result(HELD)
+    with pytest.raises(EndedError, match="by signal"):
+        worker.call(os.kill, worker.call(os.getpid), signal.SIGRTMIN + 1)

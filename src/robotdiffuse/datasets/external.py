@@ -20,9 +20,8 @@ from robotdiffuse import __version__
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.core.errors import InputError, check_type, counted, numbers, reading, shown
-from robotdiffuse.core.input_files import file_name, input_file
-from robotdiffuse.core.output_files import check_output, lock_folder, write_atomically
+from robotdiffuse.core.errors import InputError, check_type, counted, joined, numbers, reading, shown
+from robotdiffuse.core.files import check_output, file_name, input_file, lock_folder, write_atomically
 from robotdiffuse.core.settings import Bound, converted
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.datasets.shards import (
@@ -43,7 +42,7 @@ from robotdiffuse.datasets.shards import (
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.problem import LIMIT_SLACK, checked_configuration
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, check_joints
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.shapes import Box, Sphere
@@ -111,11 +110,18 @@ def write_dataset(
     if not motions:
         raise InputError("paths is empty; a data set has at least one motion")
     per_path = [scenes] * len(motions) if isinstance(scenes, Scene) else list(scenes)
-    if len(per_path) != len(motions) or not all(isinstance(scene, Scene) for scene in per_path):
+    if len(per_path) != len(motions):
         raise InputError(
             f"scenes has {counted(len(per_path), 'entry', 'entries')}; give one rd.Scene, or one "
             f"for each of {len(motions)} paths"
         )
+    for i, scene in enumerate(per_path):
+        check_type(f"scenes[{i}]", scene, Scene, "a rd.Scene")
+        if scene.allowed_contacts:
+            touched = joined([name for name, _ in scene.allowed_contacts])
+            raise InputError(
+                f"scenes[{i}] has allowed_contacts with {touched}; data sets keep none: leave out the shapes"
+            )
     floor = _shared_floor(per_path)
     slots = max(len(scene.shapes) for scene in per_path) - (floor is not None)
     packed = PackedScenes.pack(per_path, slots, floor is not None)
@@ -196,7 +202,10 @@ def measured_row(
 
 
 def _positions(robot: Robot, i: int, path: object) -> ndarray:
-    positions = path.positions if isinstance(path, Path | Trajectory) else path
+    positions = path
+    if isinstance(path, Path | Trajectory):
+        positions = path.positions
+        check_joints(f"paths[{i}]", path.joint_names, robot)
     q = numbers(positions)
     if q is None or q.ndim != 2 or q.shape[1] != robot.dof or len(q) < 2:
         names = ", ".join(robot.joint_names)
@@ -230,8 +239,8 @@ def export_npz(folder: str | FilePath, file: str | FilePath) -> tuple[int, int]:
 
     Returns the number of written motions and the number of motions that were left out.
 
-    Raises InputError if there is no data set, if it has no such scene, if its motions do not have 254
-    waypoints of 7 joints, or if the file cannot be written.
+    Raises InputError if there is no data set or it is damaged, if it has no such scene, if its motions do not
+    have 254 waypoints of 7 joints, or if the file does not end in .npz or cannot be written.
     """
     file = check_output(file, (".npz",))
     manifest = read_manifest(folder)
@@ -306,7 +315,7 @@ def _read(file: str | FilePath) -> tuple[Float32[ndarray, "n 254 7"], Float32[nd
     with reading(file), np.load(file, allow_pickle=False) as stored:
         x, y = (np.asarray(stored[name], np.float32) for name in row_shapes)
     for (name, row), array in zip(row_shapes.items(), (x, y), strict=True):
-        if array.shape != (len(x), *row) or not len(x):
+        if array.shape != (*x.shape[:1], *row) or not len(x):
             shape = " x ".join(map(str, ("n", *row)))
             raise InputError(f"{file}: {name} has shape {array.shape}; it must be {shape}, with n at least 1")
         if not np.isfinite(array).all():

@@ -5,13 +5,15 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import partial
-from pathlib import Path as FilePath
+from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float32, Int8
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, check_name, needs
+from robotdiffuse.core.errors import InputError, check_name, check_type, described, needs, shown
+from robotdiffuse.core.settings import Bound, Count, converted
 from robotdiffuse.datasets.shards import SPLITS, read_manifest, read_rows
 from robotdiffuse.robots.kinematic_tree import JointNormalizer
 from robotdiffuse.robots.robot import Robot
@@ -27,6 +29,8 @@ with needs("torch", "train"):
 SHARDS_PER_BLOCK = 16
 """Number of shards whose rows are shuffled together. 16 shards of 500 rows are 57 MB of
 memory-mapped files."""
+Seed = Annotated[int, Bound(least=-(2.0**63), below=2.0**63)]
+"""The seeds that PyTorch takes."""
 MAX_THREADS = 8
 """Largest number of threads that prefetch batches."""
 
@@ -62,7 +66,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
 
     def __init__(
         self,
-        folder: str | FilePath,
+        folder: str | Path,
         split: str = "train",
         points: int = 1400,
         sort_points: bool = False,
@@ -89,16 +93,25 @@ class RopDataset(Dataset[dict[str, Tensor]]):
                 damaged shards, and data of another robot.
         """
         check_name("split", split, SPLITS)
-        if points < 1:
-            raise InputError(f"points is {points}; it must be at least 1")
-        if waypoints is not None and waypoints < 2:
-            raise InputError(f"waypoints is {waypoints}; it must be at least 2")
-        self._arguments = (folder, split, points, sort_points, device, seed, robot, waypoints)
+        points = converted("points", Count, points)
+        seed = converted("seed", Seed, seed)
+        if waypoints is not None:
+            waypoints = converted("waypoints", Annotated[int, Bound(least=2.0)], waypoints)
+        if robot is not None:
+            check_type("robot", robot, Robot, "a rd.Robot")
         self.manifest = read_manifest(folder)
+        # the full path, since a copy from a pickle may be read in another working folder
+        folder = Path(folder).absolute()
+        self._arguments = (folder, split, points, sort_points, device, seed, robot, waypoints)
         self.waypoints = waypoints or self.manifest.waypoints
         self.points = points
         self.sort_points = sort_points
-        self.device = torch.device(device)
+        try:
+            self.device = torch.device(device)
+            torch.empty(0, device=self.device)
+        except (AssertionError, RuntimeError, TypeError) as error:  # PyTorch without CUDA raises the first
+            why = described(error)
+            raise InputError(f"device is {shown(device)}; PyTorch cannot use it: {why}") from None
         self.seed = seed
         self._generators: dict[int, torch.Generator] = {}
         self.normalizer = JointNormalizer(np.array(self.manifest.lower), np.array(self.manifest.upper))
@@ -152,7 +165,8 @@ class RopDataset(Dataset[dict[str, Tensor]]):
     ) -> Iterator[RopBatch]:
         """Read one epoch of batches, prefetched by as many threads as PyTorch uses, at most 8.
 
-        Rows are shuffled within blocks of 16 shards, and shards among blocks, so that reads are local.
+        The shards are put in random order, and the rows are shuffled within blocks of 16 shards. So
+        batches that follow each other read the same few files.
 
         Args:
             batch_size: Number of motions in a batch; the last batch may be smaller.
@@ -167,8 +181,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         Raises:
             InputError: For a batch size below 1.
         """
-        if batch_size < 1:
-            raise InputError(f"batch_size is {batch_size}; it must be at least 1")
+        batch_size = converted("batch_size", Count, batch_size)
         generator = generator or torch.Generator().manual_seed(self.seed)
         order = self._shuffled(generator) if shuffle else np.arange(len(self))
         starts = range(0, len(self), batch_size)
@@ -195,7 +208,9 @@ class RopDataset(Dataset[dict[str, Tensor]]):
             pool.shutdown(wait=True, cancel_futures=True)
 
     def _shuffled(self, generator: torch.Generator) -> ndarray:
+        """A random order of the items: blocks of shards in random order, each with its items shuffled."""
         shard = self._places[:, 0]
+        # items are sorted by shard: the first item of each shard, and the number of items
         first = np.searchsorted(shard, np.arange(len(self._trajectories) + 1)).tolist()
         shards = torch.randperm(len(self._trajectories), generator=generator).tolist()
         blocks = [np.zeros(0, np.int64)]

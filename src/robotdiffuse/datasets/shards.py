@@ -31,8 +31,16 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError, located, needs, reading, shown
-from robotdiffuse.core.input_files import file_name, input_file, read_json
-from robotdiffuse.core.output_files import replaced_folder, write_atomically
+from robotdiffuse.core.files import (
+    JsonObject,
+    file_name,
+    input_file,
+    parse_json,
+    read_text,
+    replaced_folder,
+    write_atomically,
+)
+from robotdiffuse.core.interrupts import delay_interrupts
 from robotdiffuse.core.settings import Count, Natural, Settings
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Configurations, Mask, Path, Pose, Trajectory, Values
@@ -60,7 +68,7 @@ class Manifest(Settings):
     waypoints: Count
     timing: str
     """How waypoints are spaced: "arc", evenly in joint-space length, or "time"."""
-    families: dict[str, dict[str, Any]]
+    families: dict[str, JsonObject]
     """Settings of each family of scenes. The array `family` contains indices into this mapping."""
     floors: dict[str, dict[str, list[float]] | None]
     """By family, `center` and `size` of the box on which its scenes stand [m]; None for a family without a
@@ -73,7 +81,7 @@ class Manifest(Settings):
     """Number of trajectories of the whole data set."""
     shard: Count
     """Number of rows of a shard."""
-    settings: dict[str, Any]
+    settings: JsonObject
     """Settings of the generation of the data set."""
     versions: dict[str, str]
 
@@ -118,7 +126,7 @@ class Manifest(Settings):
 
     def floor(self, family: int) -> Box | None:
         """The floor of a family, given by its index in `families`; None if its scenes have no floor."""
-        floor = list(self.floors.values())[family]
+        floor = self.floors[list(self.families)[family]]
         return None if floor is None else Box(**floor, name="floor")
 
     def check_robot(self, robot: Robot) -> None:
@@ -142,8 +150,9 @@ def read_manifest(folder: str | FilePath) -> Manifest:
     file = file_name(folder, "folder") / MANIFEST
     if not os.path.lexists(file):
         raise InputError(f"no data set: there is no {file}; make one with: robotdiffuse data generate")
+    text = read_text(file)
     with located(f"{file} is damaged"):
-        data = read_json(file)
+        data = parse_json(text, MANIFEST)
     if not isinstance(data, dict) or "format" not in data:
         raise InputError(f"{file} is no manifest of a data set: it has no format")
     check_format(file, data.pop("format"))
@@ -258,6 +267,8 @@ def _zarr() -> ModuleType:
     return zarr
 
 
+# Ctrl-C within a call of zarr leaves coroutines behind, which warn at the exit
+@delay_interrupts()
 def write_shard(
     folder: str | FilePath, index: int, arrays: dict[str, ndarray], counts: dict[str, int]
 ) -> None:
@@ -269,9 +280,11 @@ def write_shard(
     zarr = _zarr()
     target = shard_path(folder, index)
     wrong = {*arrays, "times"} ^ ARRAYS.keys()
+    if wrong:
+        raise InputError(f"shard {index}: arrays are missing or unknown: {sorted(wrong)}")
     rows = {name: len(array) for name, array in arrays.items()}
-    if wrong or len(set(rows.values())) != 1:
-        raise InputError(f"shard {index}: missing or unknown arrays {sorted(wrong)}, or unequal rows: {rows}")
+    if len(set(rows.values())) != 1:
+        raise InputError(f"shard {index}: unequal rows: {rows}; all arrays must have the same number")
     converted = {name: np.ascontiguousarray(arrays[name], ARRAYS[name][0]) for name in sorted(arrays)}
     attributes = {
         "format": FORMAT,
@@ -308,11 +321,12 @@ def _fingerprint(arrays: dict[str, ndarray]) -> str:
     return hashlib.sha256(json.dumps(fingerprints).encode()).hexdigest()[:16]
 
 
+@delay_interrupts()
 def read_shard(folder: str | FilePath, index: int, names: tuple[str, ...] | None = None) -> Shard:
     """Read a shard, or the named arrays of it; `trajectories` is mapped from the disk, read-only.
 
-    Raises InputError, naming shard and array, for missing or truncated data. Values are not checked; see
-    `check_shard`.
+    Raises InputError, naming the shard, for missing or damaged data and for another version of the format.
+    Values are not checked; see `check_shard`.
     """
     path = shard_path(folder, index)
     group = _open(path)
@@ -377,7 +391,7 @@ def check_shapes(folder: str | FilePath, shard: Shard, manifest: Manifest) -> No
 
 
 def check_shard(folder: str | FilePath, index: int, manifest: Manifest) -> Shard:
-    """Read a shard and check all that needs no robot: shapes, types, finite numbers and fingerprints.
+    """Read a shard and check shapes, types, finite numbers and the fingerprint; indices are not checked.
 
     Raises InputError, naming shard and array, for the first defect.
     """
@@ -418,7 +432,8 @@ def pick_rows(sizes: dict[int, int], count: int | None, seed: int) -> dict[int, 
 
 
 def random_rows(folder: str | FilePath, count: int, seed: int) -> Iterator[tuple[Shard, Int[ndarray, "n"]]]:
-    """Yields shards with random rows of each, `count` rows in all. Raises InputError for a damaged shard."""
+    """Yields shards with random rows of each, `count` rows in all, or all rows if there are fewer. Raises
+    InputError for a damaged shard."""
     sizes = {index: len(read_shard(folder, index, ("family",))) for index in shard_indices(folder)}
     for index, rows in pick_rows(sizes, count, seed).items():
         if len(rows):
@@ -452,7 +467,7 @@ def row_of(
     padding = [(0, most_goals - len(goals)), (0, 0)]
     straight = float(np.linalg.norm(q[-1].astype(np.float64) - q[0]))
     wxyz = quaternion_from_rotation(T_base_tip[:3, :3])
-    row: dict[str, Any] = values | {
+    row: JsonObject = values | {
         "trajectories": q,
         "start": q[0],
         "goals": np.pad(goals, padding, constant_values=np.nan),
@@ -477,7 +492,8 @@ def scenes_of(manifest: Manifest, shard: Shard, rows: slice = slice(None)) -> Pa
     names = list(manifest.families)
     if len(family) and not 0 <= family.min() <= family.max() < len(names):
         wrong = family[(family < 0) | (family >= len(names))][0]
-        raise InputError(f"family is {wrong}; the manifest has {len(names)}: {', '.join(names)}")
+        known = f"the manifest has {len(names)}: {', '.join(names)}"
+        raise InputError(f"shard {shard.index}: family is {wrong}; {known}")
     floors = np.array([floor_row(manifest.floor(i)) for i in range(len(names))]).reshape(-1, 6)
     return PackedScenes(shard["obstacle_kinds"][rows], shard["obstacle_params"][rows], floors[family])
 
@@ -529,8 +545,8 @@ class Rows:
     scenes: PackedScenes
     """The scenes with their floors."""
     split: Int8[ndarray, "n"]
-    """Index into SPLITS; -1 for copies that must not be used: those of rows that are not for training, and
-    those that touch the base link."""
+    """Index into SPLITS. -1 for turned copies that must not be used: copies of rows that are not for
+    training, and copies in which the arm collides with itself, such as with the base link."""
 
 
 def read_rows(

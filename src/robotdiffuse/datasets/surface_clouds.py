@@ -43,8 +43,8 @@ def surface_clouds(
     The result is on the generator's device. If too few samples are inside the region, points are repeated;
     if none is, the scene's cloud is all zeros.
 
-    region: only points inside it.
-    ordered: sorted by x, then y, then z, for encoders that depend on the order.
+    region: the points are inside it.
+    ordered: whether they are sorted by x, then y, then z, for encoders that depend on the order.
     """
     clouds = torch.zeros(len(scenes), count, 3, dtype=torch.float32)
     if scenes.kinds.size and count:
@@ -110,7 +110,7 @@ def fill_clouds(kinds, params, seeds, region, out):
             j = 0
             while j < last and pick >= ends[j]:
                 j += 1
-            # a point (u, v) of the unit square around 0; for a sphere, of the disc in it
+            # a point (u, v) of the unit square around 0; for a sphere, of the largest disc in this square
             while True:
                 x = _next(x)
                 u = np.float32(x >> np.uint64(40)) * _UNIT - _HALF
@@ -126,7 +126,10 @@ def fill_clouds(kinds, params, seeds, region, out):
                 out[i, filled, 1] = params[i, j, 1] + radius * ring * v
                 out[i, filled, 2] = params[i, j, 2] + radius * (_ONE - _TWO * _FOUR * s)
             else:
-                # (u, v) on one of the six faces, chosen by area
+                # The point (u, v) on one of the six faces: the offset of `pick` within the area of the box
+                # chooses a pair of opposite faces, and the lowest bit of x one of the two. The columns of
+                # `axes` are the edges of the box: `face` is normal to the pair, and the indices face - 1 and
+                # face - 2, of which negative ones count from the end, are the other two.
                 offset = pick - (ends[j - 1] if j > 0 else _ZERO)
                 side = _HALF if x & np.uint64(1) else -_HALF
                 face = int(offset >= faces[j, 0]) + int(offset >= faces[j, 1])
@@ -144,8 +147,9 @@ def fill_clouds(kinds, params, seeds, region, out):
 
 @kernel(error_model="numpy")
 def _prepare(kind, row, faces, axes):
-    """Area of a shape [m²]. Writes to `axes` the shape's axes times its sizes, and to `faces` the area of the
-    first pair of a box's opposite faces, and of the first two pairs together."""
+    """Area of a shape [m²]. Writes the edges of its box to the columns of `axes` [m]. For a box, writes to
+    `faces` the area of the pair of faces that are normal to the first edge, and this area plus that of the
+    second pair."""
     if kind == NONE:
         return _ZERO
     if kind == SPHERE:

@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -22,33 +22,32 @@ from robotdiffuse.baselines.controls import (
     ControlSettings,
 )
 from robotdiffuse.core.errors import InputError, check_name, counted
-from robotdiffuse.core.output_files import check_not_input, lock_folder
+from robotdiffuse.core.files import check_not_input, lock_folder
 from robotdiffuse.core.settings import Count, OneOf, Settings
 from robotdiffuse.core.tables import Column, Figure, Table
 from robotdiffuse.core.types import Values
 from robotdiffuse.datasets.shards import read_manifest
-from robotdiffuse.evaluation.bench_comparisons import Mean
+from robotdiffuse.evaluation.bench_comparisons import Mean, bootstrap_interval, wilson_interval
 from robotdiffuse.evaluation.metrics import link_length
 from robotdiffuse.evaluation.paper import paper_report, straight_line_counts
-from robotdiffuse.evaluation.problem_sets import hard_cases
 from robotdiffuse.evaluation.report import Report, share_cell
 from robotdiffuse.evaluation.runs import (
     NETWORK_ALONE,
     Record,
     from_control,
     from_network,
+    hard_cases,
     run_all,
     sampled,
     sampling_digest,
 )
-from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
 from robotdiffuse.learning.checkpoint import load_network
 from robotdiffuse.learning.training.config import CONFIGS, EncoderTraining, planner_training
 from robotdiffuse.learning.training.tasks import train_encoder, train_planner
 from robotdiffuse.planning.diffusion import Diffusion
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.rop import ROP, Rop
-from robotdiffuse.problems.held_out import Case
+from robotdiffuse.problems.files import Case
 from robotdiffuse.processes.workers import Workers
 from robotdiffuse.robots import load_robot
 
@@ -173,11 +172,12 @@ def run_ablation(
     the work.
 
     Raises InputError for an unknown row, listing the known ones, for data of another robot, and if `out` is
-    the folder of the data.
+    the folder of the data, is used by another process, cannot be written, or holds networks that were trained
+    with other numbers of samples or on different data.
     """
     for name in rows:
         check_name("row of Table 2", name, ROWS)
-    out = FilePath(settings.out)
+    out = Path(settings.out)
     check_not_input(out, settings.data)
     read_manifest(settings.data).check_robot(load_robot("panda"))
     configs = dict.fromkeys(ROWS[name].config for name in rows)
@@ -234,7 +234,7 @@ class Training(NamedTuple):
         return f"{self.config}_seed{self.seed}" if self.seed else self.config
 
 
-def _training(file: FilePath, name: str, budget: int) -> dict[str, Any]:
+def _training(file: Path, name: str, budget: int) -> dict[str, Any]:
     """The entry about the training in the file of a network. Raises InputError if the network was trained
     with another number of samples than `budget`."""
     about = json.loads(file.read_text())["training"]
@@ -248,11 +248,11 @@ def _training(file: FilePath, name: str, budget: int) -> dict[str, Any]:
 
 
 def _train(settings: AblationSettings, training: Training) -> Training:
-    out = FilePath(settings.out) / training.folder
+    out = Path(settings.out) / training.folder
     if not (out / "model.json").exists():
         options = {"data": settings.data, "samples": settings.samples, "seed": training.seed}
         if "encoder" not in CONFIGS[training.config].changes:
-            options["encoder"] = str(FilePath(settings.out) / ENCODER)
+            options["encoder"] = str(Path(settings.out) / ENCODER)
         train_planner(planner_training(training.config, options), str(out))
     return training
 
@@ -262,7 +262,7 @@ def _evaluate(
 ) -> Evaluation:
     """Evaluate a network or a control on problems. `which` is a training run, or a name in CONTROLS."""
     robot = load_robot("panda")
-    out = FilePath(settings.out)
+    out = Path(settings.out)
     if isinstance(which, str):
         folder = out / which.removeprefix("no network: ").replace(" ", "_")
         row = CONTROLS[which]
@@ -277,11 +277,10 @@ def _evaluate(
         folder = out / which.folder
         encoder = load_network("model", folder, robot).encoder
         assert encoder is not None  # every row has an encoder
-        steps = NETWORK_ALONE.guidance_steps if guided else 0
         planner = replace(
             NETWORK_ALONE,
             samples=settings.candidates,
-            guidance_steps=steps,
+            guidance_steps=NETWORK_ALONE.guidance_steps if guided else 0,
             weights=str(folder),
             points=encoder.settings.cloud,
         )

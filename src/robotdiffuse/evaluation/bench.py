@@ -15,17 +15,15 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from functools import cached_property
-from pathlib import Path as FilePath
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, check_name
-from robotdiffuse.core.input_files import is_file
-from robotdiffuse.core.output_files import JsonLines, lock_folder, writing
+from robotdiffuse.core.files import JsonLines, is_file, lock_folder, writing
 from robotdiffuse.core.settings import Count, Filled, OneOf, Positive, Settings
 from robotdiffuse.evaluation.metrics import measured
-from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name
 from robotdiffuse.evaluation.report import processor, versions
 from robotdiffuse.evaluation.runs import (
     CRASHED,
@@ -36,9 +34,11 @@ from robotdiffuse.evaluation.runs import (
     RecordFile,
     Results,
     Run,
+    gather_cases,
     keep_records,
     load_average,
     planner_calls,
+    problem_set_name,
     record_path,
     runs_of,
 )
@@ -46,10 +46,8 @@ from robotdiffuse.learning.weight_files import NETWORKS, folder_of, read_descrip
 from robotdiffuse.planning import PLANNERS, load_planner, planner_settings
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
-from robotdiffuse.problems.files import problem_from_record, problem_record
-from robotdiffuse.problems.held_out import Case, Progress
-from robotdiffuse.processes.ray_cluster import CLUSTERS
-from robotdiffuse.processes.workers import EndedError, NotStartedError, OverrunError, Worker
+from robotdiffuse.problems.files import Case, Progress, problem_from_record, problem_record
+from robotdiffuse.processes.workers import CLUSTERS, EndedError, NotStartedError, OverrunError, Worker
 from robotdiffuse.robots.robot import Robot
 
 CALL_ARGUMENTS = [field.name for field in fields(PlanRequest) if field.name not in ("time_limit", "seed")]
@@ -87,19 +85,19 @@ class PlannerSpec:
     @property
     def label(self) -> str:
         """The planner's name in results."""
-        name = self.name if self.weights is None else f"{self.name}@{FilePath(self.weights).name}"
+        name = self.name if self.weights is None else f"{self.name}@{Path(self.weights).name}"
         return ":".join([name, *self.settings])
 
     @property
-    def weights_hashes(self) -> dict[str, Any]:
+    def weights_hashes(self) -> Fields:
         """SHA-256 of the weights in the folder, by network; empty if the planner uses the bundled weights."""
         if self.weights is None:
             return {}
-        folder = FilePath(self.weights)
+        folder = Path(self.weights)
         names = [name for name in NETWORKS if is_file(folder / f"{name}.json")]
         return {name: read_description(folder, name).get("weights_sha256") for name in names}
 
-    def request(self) -> dict[str, Any]:
+    def request(self) -> Fields:
         """Arguments of the planner's calls, by name: until, clearance, ..."""
         request = PlanRequest().changed(text for text in self.settings if _of_call(text))
         return {name: getattr(request, name) for name in CALL_ARGUMENTS}
@@ -133,8 +131,8 @@ GRACE = 20.0
 """A process that has not answered this long after the time limit is killed [s]. In this time, the motion is
 validated and timed."""
 RESTARTS_TIMEOUT_FACTOR = 20.0
-"""Timeout for all repeated calls of a run together (`equal_time`), as a multiple of the time limit. It is
-long because computing the trajectory of each path does not count for the limit."""
+"""Timeout for all repeated calls of a run together (`equal_time`), as a multiple of the time limit; GRACE is
+added. It is long because computing the trajectory of each path does not count for the limit."""
 RUNS_PER_TASK = 20
 """Number of runs in a task of a cluster. Each task starts the planner's process again."""
 
@@ -142,7 +140,7 @@ RUNS_PER_TASK = 20
 class PlannerProcess:
     """A planner in another process. The process starts with the first run, and again after it has died."""
 
-    def __init__(self, spec: PlannerSpec, log: FilePath, cpu_time: bool = False) -> None:
+    def __init__(self, spec: PlannerSpec, log: Path, cpu_time: bool = False) -> None:
         """The output of the process is appended to the file `log`. For `cpu_time` see `BenchSettings`.
 
         Raises InputError if this file cannot be written: its process would end, which would count as a crash.
@@ -318,14 +316,14 @@ def records_of(run: Run, answers: Sequence[Fields], about: Fields) -> list[Recor
     return [run.record({"planner": label, **about, **answer}) for label, answer in pairs]
 
 
-def _log_file(logs: FilePath, label: str) -> FilePath:
+def _log_file(logs: Path, label: str) -> Path:
     return logs / f"{label.replace('/', '_')}.log"
 
 
 def _run_task(spec: PlannerSpec, runs: list[Run], restarts: bool) -> tuple[list[list[Fields]], str]:
     """The answers of the planner to these runs, and what the planner printed."""
     with TemporaryDirectory() as folder:
-        log = FilePath(folder) / "log"
+        log = Path(folder) / "log"
         process = PlannerProcess(spec, log)
         try:
             answers = [process.plan(run, restarts) for run in runs]
@@ -347,7 +345,7 @@ class BenchSettings(Settings):
     problems: Annotated[tuple[str, ...], Filled()]
     """Problem sets: families (rop, rop_dense, ...), FAMILY_nontrivial for a family without the problems
     that a straight line solves, files or folders."""
-    out: FilePath
+    out: Path
     """Folder for problems and results."""
     time_limit: Positive = 1.0
     """Time limit of a call [s]."""
@@ -378,7 +376,7 @@ class BenchSettings(Settings):
             )
 
     @property
-    def logs(self) -> FilePath:
+    def logs(self) -> Path:
         """Folder of the files with the planners' output."""
         return self.out / "logs"
 
@@ -401,8 +399,9 @@ def run_bench(settings: BenchSettings, report: Progress, done: Done) -> int:
 
     A call is not repeated if a record with a shorter time limit shows that it ended before that limit, since
     more time would not change its result. With `equal_time`, such a call is repeated if another seed could
-    change its result. Raises InputError, before any call, for bad settings or a planner that cannot be
-    loaded, and KeyboardInterrupt on Ctrl-C. Running again with the same settings then continues.
+    change its result. Raises InputError, before any call, for a folder that another process uses, a planner
+    that cannot be loaded, weights other than those of the folder's records, and problems that `gather_cases`
+    refuses; KeyboardInterrupt on Ctrl-C. Running again with the same settings then continues.
     """
     with lock_folder(settings.out):
         specs = settings.specs
@@ -412,13 +411,13 @@ def run_bench(settings: BenchSettings, report: Progress, done: Done) -> int:
         _check_weights(settings, sessions.rows)
         cases = gather_cases(list(settings.problems), settings.count, settings.out, report)
         session = _note_session(settings, sessions)
-        labels = [label + suffix for label in specs for suffix in ("", RESTARTED)[: 1 + settings.equal_time]]
+        suffixes = ("", RESTARTED) if settings.equal_time else ("",)
+        labels = [label + suffix for label in specs for suffix in suffixes]
         files = {label: RecordFile(record_path(settings.out, label)) for label in labels}
         todo = open_runs({label: file.records for label, file in files.items()}, cases, settings)
         total = len(cases) * settings.seeds * len(specs)
         done(total - len(todo), total)
-        make = on_this_machine if settings.cluster is None else on_cluster
-        results = make(settings, todo, session)
+        results = (on_this_machine if settings.cluster is None else on_cluster)(settings, todo, session)
         return keep_records(todo, results, files, lambda left: done(total - left, total))
 
 
@@ -555,7 +554,7 @@ PRESETS: dict[str, Preset] = {
 
 
 def preset_settings(
-    preset: str, out: FilePath, problems: Sequence[str] = (), count: int | None = None, **more: Any
+    preset: str, out: Path, problems: Sequence[str] = (), count: int | None = None, **more: Any
 ) -> list[BenchSettings]:
     """The bench settings of a preset, one for each of its time limits.
 
@@ -571,7 +570,11 @@ def preset_settings(
     """
     check_name("preset", preset, PRESETS)
     chosen = PRESETS[preset]
-    preset_values = {"count": min(count or chosen.count, chosen.count), "equal_time": chosen.equal_time}
+    max_count = chosen.count
+    preset_values = {
+        "count": max_count if count is None else min(count, max_count),
+        "equal_time": chosen.equal_time,
+    }
     sets = (*chosen.problems, *problems)
     return [
         BenchSettings(chosen.planners, sets, out, time_limit=limit, **preset_values, **more)

@@ -17,6 +17,7 @@ from robotdiffuse.evaluation.bench_comparisons import (
     Bench,
     Comparison,
     Curve,
+    Paired,
     Row,
     Section,
     base_name,
@@ -27,7 +28,6 @@ from robotdiffuse.evaluation.bench_comparisons import (
     solved_share,
 )
 from robotdiffuse.evaluation.metrics import METRICS, Metric
-from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.report import Report, draw_plot, interval
 from robotdiffuse.evaluation.runs import (
     CRASHED,
@@ -35,10 +35,10 @@ from robotdiffuse.evaluation.runs import (
     RAISED,
     RESTARTED,
     Record,
+    read_cases,
 )
-from robotdiffuse.evaluation.statistics import Paired
 from robotdiffuse.planning import PLANNERS, SEARCH
-from robotdiffuse.problems.held_out import Case
+from robotdiffuse.problems.files import Case
 from robotdiffuse.problems.problem import JointGoal
 
 if TYPE_CHECKING:
@@ -50,12 +50,12 @@ UNEQUAL_NOTE = (
     "--equal-time of bench run repeats such calls until the limit."
 )
 NOTES = """\
-- A call counts in a table if its limit was at least the table's, or if it ended by itself before its limit,
-  since more time would change nothing. A table compares the problems on which all its planners have such a
-  call.
+- A call counts in a table if its own limit was at least that of the table. A call that ended by itself
+  before its limit counts too, since more time would have changed nothing. A table compares the problems on
+  which all its planners have such a call.
 - success: share of problems with a verified motion found by the limit, with the 95 % interval over problems
-  (Wilson). A motion that a call returned up to 10 % or 50 ms after its own limit counts: planners stop in
-  time, and validation follows.
+  (Wilson). A motion returned after the call's own limit counts if it is late by at most 10 % of the limit
+  or 50 ms, whichever is more: planners stop in time, and validation follows.
 - collision: share of problems on which the validator refused the planner's last path because it collides.
 - link length: the paper's path length, the sum of the path lengths of all links that joints move. It is the
   mean over the problems that the planner itself solved, so planners that solve only easy problems have
@@ -63,12 +63,12 @@ NOTES = """\
   estimated: the returned path's link length, times the ratio of both paths' lengths in joint space.
 - joint length / a planner: median ratio of the length in joint space to that of the reference planner, on
   problems that both solve, with its 95 % interval (bootstrap over problems). The ratio is at equal time if
-  both planners use up the limit; † marks other ratios. restarted: a planner that ends earlier is called again
-  with other seeds until all its calls together have used up the limit, and its shortest path counts.
-  Computing trajectories is not counted.
+  both planners use up the limit; † marks other ratios. Computing trajectories is not counted.
+- restarted (in a planner's name): a planner that ends before the limit is called again with other seeds
+  until less time is left than its shortest call took. The shortest path counts.
 - first: median time to the first path of solved problems. returns: mean time until the planner returns,
-without computing the trajectory.
-  Anytime planners use up the limit, and unsolved problems count with the limit.
+  without computing the trajectory. Anytime planners use up the limit, and unsolved problems count with the
+  limit.
 - ComScore: as in the paper, the mean of success, collision, length and time until the planner returns, each
   scaled from 0 for the worst row of the table to 1 for the best. It depends on the rows of the table; rows
   with restarts are left out. `robotdiffuse reproduce table1` computes it among the paper's rows.
@@ -191,8 +191,8 @@ def _table(heading: str, rows: Sequence[Row], spec: Spec) -> Table:
 
 def _ratio(comparison: Comparison, reference: str) -> PlannerColumn:
     """A column with the ratio of path lengths to those of the reference planner, and its interval. The cell
-    is empty if the planner or the reference ended early and there is a row with restarts, which shows the
-    ratio."""
+    is empty if no problem is solved by both, and if the planner or the reference ended early and there is a
+    row of the planner with restarts, which shows the ratio."""
     full = {row.planner: row.full for row in comparison.rows}
 
     def ratio(row: Row) -> Cell:
@@ -210,8 +210,7 @@ def _ratio(comparison: Comparison, reference: str) -> PlannerColumn:
 
 def _metric(metric: Metric) -> PlannerColumn:
     """A column with the mean of a metric over the solved problems."""
-    column = Column(metric.heading, metric.unit, better=metric.better)
-    return column, lambda row: row.mean(metric)
+    return Column(metric.heading, metric.unit, better=metric.better), lambda row: row.mean(metric)
 
 
 def _of_pair(heading: str, cell: Callable[[Paired], Cell]) -> PlannerColumn:
@@ -227,7 +226,8 @@ def probability(p: float) -> str:
 
 
 def success_over_time(section: Section, planners: Sequence[str]) -> str:
-    """Draw the share of solved calls over time, as in the paper's figure 3a; returns SVG."""
+    """Draw the share of solved calls over time, as in the paper's figure 3a, without the rows with restarts;
+    returns SVG."""
 
     def steps(curve: Curve) -> tuple[ndarray, ndarray]:
         solved = np.arange(len(curve.found) + 1)
@@ -382,18 +382,19 @@ class Replay(NamedTuple):
 
 def motions_to_replay(bench: Bench, parts: Sequence[Section]) -> list[Replay]:
     """Motions to replay: for the problems with the longest detours, the shortest and the longest motion.
-    Then, for problems on which planners failed, motions that solve them; failures of the reference planner
-    come first.
+    Then, for problems on which planners failed, another planner's motion, or the straight line if none solved
+    the problem; failures of the reference planner come first.
 
     Motions are those of the main comparison of each problem set. Only problems that are stored in the folder
     are considered.
     """
     tries: list[tuple[Case, list[Record], dict[str, str]]] = []
+    # without the sections of non-trivial problems only
     for section in (section for section in parts if section.name == section.problem_set):
         main = section.main
         calls = [calls_on(bench.records[row.planner], section.problem_set) for row in main.rows]
         for case in read_cases(bench.folder, section.problem_set):
-            key = case.name, main.keys[0][1]
+            key = case.name, main.keys[0][1]  # the first seed
             if key in main.keys:
                 records = (deciding_record(planner_calls[key], main.limit) for planner_calls in calls)
                 outcomes = [outcome(record, main.limit) for record in records if record is not None]
@@ -422,9 +423,9 @@ def _detour(record: Record) -> float:
 
 
 def _failure(case: Case, solved: list[Record], failed: dict[str, str], reference: str) -> Iterator[Replay]:
-    """A replay of a problem on which a planner failed: another planner's motion, or, if none
-    solved it, the straight line to a joint goal. Yields nothing if no planner failed, or for an unsolved
-    problem with another goal."""
+    """A replay of a problem on which a planner failed: another planner's motion, or, if none solved it, the
+    straight line to a joint goal. Yields nothing if no planner failed, or if none solved the problem and its
+    goal is not a joint goal."""
     goal = case.problem.goal
     if failed and solved:
         loser = reference if reference in failed else next(iter(failed))

@@ -20,6 +20,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Natural, converted
 from robotdiffuse.core.tables import Column, Table
 from robotdiffuse.core.types import Path
 from robotdiffuse.datasets.shards import (
@@ -34,8 +35,7 @@ from robotdiffuse.datasets.shards import (
     read_shard,
     scenes_of,
 )
-from robotdiffuse.evaluation.problem_sets import read_cases
-from robotdiffuse.evaluation.runs import Record, read_records
+from robotdiffuse.evaluation.runs import Record, read_cases, read_records
 from robotdiffuse.processes.workers import Workers, in_order
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
@@ -179,6 +179,7 @@ def check_data(
             of the data, and if PyBullet is required but not installed.
     """
     began = time.perf_counter()
+    count = converted("count", Natural | None, count)
     manifest = read_manifest(folder)
     robot = load_robot(manifest.robot) if robot is None else robot
     manifest.check_robot(robot)
@@ -259,8 +260,9 @@ class _Task:
                     oracle.set_scene(scenes_of(self.manifest, shard, slice(row, row + 1)).scene(0))
                 except InputError:
                     continue  # `_defects` reports a scene that cannot be built
-                path = path_of(self.robot, shard, row)
-                contact = oracle.check_path(path, PYBULLET_STEP, PYBULLET_TOLERANCE)
+                contact = oracle.check_path(
+                    path_of(self.robot, shard, row), PYBULLET_STEP, PYBULLET_TOLERANCE
+                )
                 if contact is not None:
                     depth = -1e3 * contact.distance
                     at = contact.at

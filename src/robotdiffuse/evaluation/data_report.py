@@ -3,13 +3,13 @@
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, counted
-from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.core.files import check_output, write_atomically
 from robotdiffuse.core.tables import NO_VALUE, Column, Table, plain
 from robotdiffuse.core.types import Mask
 from robotdiffuse.datasets.shards import (
@@ -35,7 +35,8 @@ QUANTITIES = {
 SPREAD = {"least": 0.0, "5 %": 0.05, "median": 0.5, "95 %": 0.95, "most": 1.0}
 """Quantiles of each quantity over the motions."""
 SAMPLED_MOTIONS = 20_000
-"""Least number of motions, spread evenly over a larger data set, of which ARRAYS_OF_SAMPLE are read."""
+"""Least number of motions, spread evenly over a larger complete data set, of which ARRAYS_OF_SAMPLE are
+read."""
 SAMPLED_WAYPOINTS = 24
 """Number of waypoints that are read of each of these motions, spread evenly."""
 ARRAYS_OF_ALL = ("cost", "clearance", "end_clearance", "safety_distance", "line_free", "detour", "family")
@@ -101,7 +102,7 @@ class DataFigures:
         return float(self.all["safety_distance"].max())
 
 
-def read_figures(folder: str | FilePath) -> DataFigures:
+def read_figures(folder: str | Path) -> DataFigures:
     """Read the arrays for tables and plots, one shard at a time. Raises InputError if there is no data set,
     or if it is damaged or empty."""
     manifest = read_manifest(folder)
@@ -209,19 +210,19 @@ LAST_QUANTILE = 0.995
 """Histograms end at this quantile of the values; the last bar includes all larger values."""
 
 
-def write_page(folder: str | FilePath, file: str | FilePath, robot: Robot | None = None) -> DataFigures:
+def write_page(folder: str | Path, file: str | Path, robot: Robot | None = None) -> DataFigures:
     """Write tables and plots of a data set to an .html file, and return the statistics.
 
     `robot` is the robot of the data; None: the robot with the name in the manifest. Raises InputError if
     matplotlib is not installed, for a file that cannot be written, for another robot than that of the data,
     and as `read_figures` does.
     """
-    read_manifest(folder)
+    read_manifest(folder)  # first, since without a data set the page's folder is often missing too
     target = check_output(file, (".html", ".htm"))
     data = read_figures(folder)
     robot = load_robot(data.manifest.robot) if robot is None else robot
     data.manifest.check_robot(robot)
-    write_atomically(target, data_report(data, FilePath(folder).resolve().name).page)
+    write_atomically(target, data_report(data, Path(folder).resolve().name).page)
     return data
 
 
@@ -242,7 +243,7 @@ def data_report(data: DataFigures, name: str) -> Report:
     report.plot("goals.svg", caption, histograms(_goals(data), 2))
     q = data.sample["trajectories"]
     joints: Histograms = {
-        f"{name} [rad]": (
+        f"{name} [rad] or [m]": (
             np.linspace(manifest.lower[j], manifest.upper[j], 41),
             {"all waypoints": q[..., j].reshape(-1), "start": q[:, 0, j], "goal": q[:, -1, j]},
         )
@@ -274,7 +275,9 @@ def _goals(data: DataFigures) -> Histograms:
     except the best."""
     costs = data.sample["goal_costs"].astype(np.float64)
     numbers = {"given": (~np.isnan(costs)).sum(axis=1), "reached": np.isfinite(costs).sum(axis=1)}
-    excess = 100 * (costs / np.nanmin(np.where(np.isinf(costs), np.nan, costs), axis=1, keepdims=True) - 1)
+    best = np.nanmin(np.where(np.isinf(costs), np.nan, costs), axis=1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):  # the best cost is 0 if a motion stands still
+        excess = 100 * (costs / best - 1)
     excess = excess[np.isfinite(excess) & (excess > 0)]
     end = np.quantile(excess, LAST_QUANTILE) if len(excess) else 1.0
     return {

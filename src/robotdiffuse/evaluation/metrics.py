@@ -11,7 +11,14 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.exact_meshes import forward_frames
-from robotdiffuse.core.types import Configurations, Path, PlanResult, State, Trajectory, Values
+from robotdiffuse.core.types import (
+    Configurations,
+    Path,
+    PlanResult,
+    State,
+    Trajectory,
+    Values,
+)
 from robotdiffuse.datasets.shards import resample
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.straight_line import straight_line_time

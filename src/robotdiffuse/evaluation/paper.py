@@ -22,20 +22,31 @@ from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.tables import Column, Table, plain
 from robotdiffuse.core.types import Configurations, Path
 from robotdiffuse.evaluation.bench import BenchSettings, Done, run_bench
-from robotdiffuse.evaluation.bench_comparisons import Bench, Mean, Section, read_bench, sections
+from robotdiffuse.evaluation.bench_comparisons import (
+    Bench,
+    Indicators,
+    Mean,
+    Section,
+    bootstrap_interval,
+    comscores,
+    read_bench,
+    sections,
+    wilson_interval,
+)
 from robotdiffuse.evaluation.bench_report import about, crashes, success_over_time
 from robotdiffuse.evaluation.metrics import METRICS
-from robotdiffuse.evaluation.problem_sets import hard_cases, read_cases, validator
 from robotdiffuse.evaluation.report import Report, draw_plot, share_cell
 from robotdiffuse.evaluation.runs import (
     NETWORK_ALONE,
     Record,
     from_network,
+    hard_cases,
+    read_cases,
     run_all,
     sampled,
     sampling_digest,
+    validator,
 )
-from robotdiffuse.evaluation.statistics import Indicators, bootstrap_interval, comscores, wilson_interval
 from robotdiffuse.learning.diffusion import SAMPLERS
 from robotdiffuse.learning.motion_model import MotionModelSettings, link_clearances
 from robotdiffuse.learning.weight_files import POINTS, folder_of, read_description, weights_for
@@ -43,7 +54,7 @@ from robotdiffuse.planning.diffusion import Diffusion, DiffusionSettings, encode
 from robotdiffuse.planning.pose_goals import GOAL_COUNT, pose_configurations
 from robotdiffuse.problems.families.family import POSITION
 from robotdiffuse.problems.families.rop import ROP, Rop
-from robotdiffuse.problems.held_out import SEED, Case, CaseFile, Progress, goal_of
+from robotdiffuse.problems.files import SEED, Case, CaseFile, Progress, goal_of
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
 
@@ -67,8 +78,8 @@ def add_notes(report: Report, notes: Sequence[str]) -> None:
 
 POSE = "rop_pose"
 JOINT = "rop_joint"
-"""Problem sets. Both have the same scenes and starts; the goal is a pose (POSE) or one configuration
-(JOINT)."""
+"""Problem sets. A problem of the same name has the same scene and start in both; the goal is a pose (POSE) or
+one configuration (JOINT). Each set leaves out its own trivial problems."""
 GOALS = {POSE: "a pose with ten configurations", JOINT: "one configuration"}
 STREAM = 1_000
 """Part of the random seed, different from that of the families' held-out problems."""
@@ -162,7 +173,7 @@ PAPER_SAMPLES = 1_600_000
 """Number of samples of the paper's training: 25,000 batches of 64."""
 GUIDED_SAMPLE = ("samples=1", "repeat=false")
 """Planner settings for a single sample, without further samples if the validator refuses it."""
-ONE_SAMPLE = ("samples=1", "guidance_steps=0", "repeat=false")
+UNGUIDED_SAMPLE = ("samples=1", "guidance_steps=0", "repeat=false")
 """Planner settings for a single sample without collision guidance, as in the row JPC of the paper's Table 2
 (losses of joints, points and collision)."""
 NO_WEIGHTS = (
@@ -205,11 +216,10 @@ The first four columns are the normalized figures:
 The order of the rows is as printed, except for RRT* and MPiNets, which have equal printed scores. The cause
 of the differences is unknown. These explanations were tried:
 
-- Rounding: multiplied by four, each printed score has no more than two decimals (1.67, 0.76, 1.67, 2.58,
-  3.06), so normalized values were probably first rounded to two decimals. Then MPD has 0.645 exactly,
-  MPiNets 0.4150, and MPNet 0.1975, which is 0.19 if truncated. RRT* (0.4475) and RobotDiffuse (0.7750)
-  differ from the printed scores by one digit. So typing errors in three scores (MPiNets, RRT*, RobotDiffuse)
-  and a truncated one (MPNet) would explain all differences.
+- Rounding: four times each printed score has at most two decimals (1.67, 0.76, 1.67, 2.58, 3.06), so the
+  normalized values were probably rounded to two decimals. This gives MPD exactly (0.645), and MPNet if
+  0.1975 is truncated to 0.19. RRT* (0.4475), RobotDiffuse (0.7750) and MPiNets (0.4150) remain different.
+  Typing errors in these three would explain all differences.
 - Other normalizations of the columns (fractions of the maximum, logarithms, ranks; all combinations): the
   largest difference is still 0.025 or more.
 - Other weights: with the best weights that sum to 1, the largest difference is 0.011. With (0.2418, 0.1870,
@@ -237,10 +247,10 @@ ROWS = (
     Row("MPD", "mpd", "MPD"),
     Row("diffusion, as it ships: clearances as inputs", "diffusion", PAPER_METHOD),
     Row("diffusion, a single sample", "diffusion:samples=1:repeat=false"),
-    Row("diffusion, a single sample, no guidance", ":".join(["diffusion", *ONE_SAMPLE])),
+    Row("diffusion, a single sample, no guidance", ":".join(["diffusion", *UNGUIDED_SAMPLE])),
     Row(
         "diffusion, a single sample, no guidance, no clearances: 32 points of the scene",
-        ":".join([f"diffusion@{POINTS}", *ONE_SAMPLE]),
+        ":".join([f"diffusion@{POINTS}", *UNGUIDED_SAMPLE]),
     ),
     Row("robotdiffuse, the default: aorrtc", "robotdiffuse"),
     Row("no planner: line to the nearest goal", "straight_line:goals=nearest"),
@@ -273,7 +283,7 @@ class Table1Settings:
     """Folder with weights of a network without clearances as inputs, such as a network trained with the
     config `paper` or `points`. The network gets two rows of single samples: with and without guidance."""
     data: str | None = None
-    """Folder of a data set, for a row with the nearest motions of the data."""
+    """Folder of a data set, for a row with the motions whose start and goal are nearest to the problem's."""
     workers: int = 1
     """See `BenchSettings`."""
     cluster: str | None = None
@@ -293,7 +303,7 @@ class Table1Settings:
         title = _title(self.paper_weights)
         diffusion = f"diffusion@{self.paper_weights}"
         guided = Row(title, ":".join([diffusion, *GUIDED_SAMPLE]))
-        unguided = Row(f"{title}, no guidance", ":".join([diffusion, *ONE_SAMPLE]))
+        unguided = Row(f"{title}, no guidance", ":".join([diffusion, *UNGUIDED_SAMPLE]))
         return (*ROWS[:5], guided, unguided, *ROWS[5:], *controls)
 
     def command(self, name: str) -> str:
@@ -336,11 +346,11 @@ def run_table1(settings: Table1Settings, report: Progress, done: Done) -> Bench:
 def _title(folder: str) -> str:
     """Name of the row for the weights in a folder, with their encoder, their denoiser and their number of
     training samples in percent of the paper's. Raises InputError if the folder has no weights."""
-    about = read_description(folder_of(folder), "model")
-    settings = MotionModelSettings.from_json(about.get("settings"), f"{folder}/model.json: settings")
+    description = read_description(folder_of(folder), "model")
+    settings = MotionModelSettings.from_json(description.get("settings"), f"{folder}/model.json: settings")
     parts = settings.encoder, settings.denoiser, settings.waypoints
     title = AS_IN_PAPER if parts == PAPER_PARTS else WITHOUT_CLEARANCES
-    trained = 100 * about.get("training", {}).get("samples", 0.0) / PAPER_SAMPLES
+    trained = 100 * description.get("training", {}).get("samples", 0.0) / PAPER_SAMPLES
     network = f"{settings.encoder}, {settings.denoiser}"
     return f"{title}: {network}, {trained:.0f} % of {PAPER_SAMPLES / 1e6:g} M samples"
 
@@ -357,8 +367,8 @@ def _check_paper_weights(folder: str, time_limit: float) -> None:
             "them: train with --config paper or points"
         )
     steps = model.settings.sampling_steps or model.schedule.steps
-    inputs = (1, model.waypoints, model.feature_count), 1, (1, model.condition_count)
-    zeros = [np.zeros(shape, np.float32) for shape in inputs]
+    shapes = (1, model.waypoints, model.feature_count), 1, (1, model.condition_count)
+    zeros = [np.zeros(shape, np.float32) for shape in shapes]
     seconds = steps * min(timeit.repeat(lambda: model.denoised(*zeros), number=1, repeat=3))
     if seconds > time_limit:
         raise InputError(
@@ -386,10 +396,12 @@ def table1(settings: Table1Settings, bench: Bench) -> Report:
     for section in sections(replace(bench, records=records), [settings.time_limit]):
         loads += section.main.loads
         report.table(_table(section, rows), level=2)
-    shares = [f"{100 * trivial_share(settings.out, name):.0f} % with {kind}" for name, kind in GOALS.items()]
+    shares = [
+        f"{100 * trivial_share(settings.out, name):.0f} % (goal: {kind})" for name, kind in GOALS.items()
+    ]
     trivial = (
         "Trivial problems, in which the straight line to a goal configuration is free, are left out: "
-        f"{' and '.join(shares)} as the goal. The paper's figures include them."
+        f"{' and '.join(shares)}. The paper's figures include them."
     )
     lines = [trivial, *notes(settings), *about(bench), *crashes(bench)]
     if loads:
@@ -399,8 +411,8 @@ def table1(settings: Table1Settings, bench: Bench) -> Report:
 
 
 def scores(rows: Sequence[Row], indicators: dict[str, Indicators]) -> dict[str, float]:
-    """ComScores of the rows. The five rows of the paper are normalized together. For the score of any
-    further row, this row takes the place of the paper's method among the five."""
+    """ComScores of the rows, from measured indicators. The five rows with a counterpart in the paper are
+    normalized together. Any further row is scored in the place of our counterpart of RobotDiffuse."""
     ours = next(row.name for row in rows if row.paper == PAPER_METHOD)
     other_rows = [row.name for row in rows if row.paper and row.paper != PAPER_METHOD]
     scores_with = {
@@ -414,11 +426,12 @@ def scores(rows: Sequence[Row], indicators: dict[str, Indicators]) -> dict[str, 
 
 
 def _table(section: Section, rows: dict[str, Row]) -> Table:
-    """The table of a problem set. `rows` are given by planner."""
+    """The table of a problem set. rows: the row of each planner, by its text for `bench run`."""
     comparison = section.main
-    title = f"Goal: {GOALS[section.problem_set]}; {counted(comparison.problems, 'nontrivial problem')}"
+    title = f"Goal: {GOALS[section.problem_set]}; {counted(comparison.problems, 'non-trivial problem')}"
     indicators = {}
     for planner_row in comparison.rows:
+        # the mean time of all calls, solved or not, each until its planner returned
         time = Mean.of(o.record.time for o in planner_row.outcomes).value
         indicators[rows[planner_row.planner].name] = replace(planner_row.figures, time=time)
     comscore = scores(tuple(rows.values()), indicators)
@@ -461,14 +474,17 @@ def notes(settings: Table1Settings) -> list[str]:
     texts = [
         f"Every call has {settings.time_limit:g} s{' of CPU time' * settings.cpu_time}; in the paper up to "
         "600 s. RRT* always uses the whole limit.",
-        "success: share of problems with a motion that passes the validator and ends within 1 cm and 15° of "
-        "the pose, with the 95 % interval by Wilson. collision: share of problems on which the validator "
+        "success: share of problems with a motion that passes the validator, with the 95 % interval by "
+        "Wilson. The motion must end within 1 cm and 15° of a goal pose, or at a goal configuration. "
+        "collision: share of problems on which the validator "
         "refused the planner's last path because it collides. RRT*, MPNet, MPiNets, MPD and diffusion with "
         "default settings try again until time runs out. The rows of a single sample have one motion per "
         "problem, as in the paper. The paper's network was trained on 1.6 M samples.",
-        "Means are over the problems that a row solves, with 95 % intervals. A row that solves only easy "
-        "problems therefore has short motions. length of links 1 to 7: path lengths of the origins of the "
-        "links that joints move, which the paper calls path length (its arm has no hand; it gives no unit). "
+        "Means are over the problems that a row solves, with 95 % intervals; a row that solves only easy "
+        "problems therefore has short motions. Only the mean time is over all calls, without an interval. "
+        "length of links 1 to 7: the sum of the path lengths of the origins of the links that joints move. "
+        "The paper calls this path length and states no unit. The hand is not counted: the paper's arm has "
+        "none. "
         "log jerk: logarithm of the dimensionless jerk; turning: sum of the angles between segments.",
         "ComScore: normalized as in the paper, over the paper's five rows as measured here. For the score of "
         "any further row, this row takes the place of the paper's method among the five.",
@@ -531,12 +547,16 @@ def denoising(problem: Problem) -> list[Noisy]:
     return motions
 
 
-def success_by_steps(out: FilePath, count: int) -> dict[str, dict[int, list[Record]]]:
+RecordsBySteps = dict[str, dict[int, list[Record]]]
+"""Records of each kind of guidance, by the number of denoising steps."""
+
+
+def success_by_steps(out: FilePath, count: int) -> RecordsBySteps:
     """Records of batches of 16 samples of the network on `count` problems that the straight line does not
     solve, by guidance and number of denoising steps. They are stored in the folder."""
     cases = hard_cases("rop", count, out / "problems")
     weights = weights_for("model", load_robot("panda"))
-    records: dict[str, dict[int, list[Record]]] = {}
+    records: RecordsBySteps = {}
     for name, guidance in (("no guidance", 0), ("guidance", DiffusionSettings().guidance_steps)):
         methods = {}
         for steps in STEPS:
@@ -548,7 +568,7 @@ def success_by_steps(out: FilePath, count: int) -> dict[str, dict[int, list[Reco
     return records
 
 
-def plot_success_by_steps(records: dict[str, dict[int, list[Record]]]) -> str:
+def plot_success_by_steps(records: RecordsBySteps) -> str:
     """Plot of the share of single samples that pass the validator over the number of denoising steps; SVG."""
 
     def fill(figure: "PlotFigure") -> None:

@@ -1,6 +1,6 @@
 """A report: texts, tables and plots, written as Markdown or as an HTML page that works offline.
 
-Plots are SVG. They need matplotlib, which is not part of the core install.
+Plots are SVG. They need matplotlib, and pages markdown-it-py, which are not part of the core install.
 """
 
 import html
@@ -9,14 +9,14 @@ import platform
 import re
 from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import distributions
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.core.errors import needs
-from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.files import write_atomically
 from robotdiffuse.core.tables import Figure, Table, markdown, plain
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ class Report:
 
     def picture(self, file: str, caption: str) -> None:
         """Add a picture: a file in the folder of the report."""
-        self.add(plain(caption), f"![{FilePath(file).stem}]({file})")
+        self.add(plain(caption), f"![{Path(file).stem}]({file})")
 
     @property
     def markdown(self) -> str:
@@ -75,13 +75,14 @@ class Report:
     @property
     def page(self) -> str:
         """The report as HTML, with the plots in the page and links to the sections."""
-        from markdown_it import MarkdownIt
+        with needs("markdown-it-py", "data"):
+            from markdown_it import MarkdownIt
 
         body = MarkdownIt().enable("table").render(self.markdown)
         for file, svg in self.plots.items():
             # make the ids unique: plots use the same ids, and a reference to an id in another plot draws
             # nothing
-            svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{FilePath(file).stem}-", svg)
+            svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{Path(file).stem}-", svg)
             body = re.sub(rf'<img src="{re.escape(file)}"[^>]*>', lambda _, svg=svg: svg, body)
         titles = re.findall("<h2>(.*?)</h2>", body)
         for i, title in enumerate(titles):
@@ -95,7 +96,7 @@ class Report:
         )
         return f"{head}{body}</body></html>\n"
 
-    def write(self, file: FilePath) -> None:
+    def write(self, file: Path) -> None:
         """Write the report as Markdown, and the plots as files in the same folder."""
         write_atomically(file, self.markdown, make_folder=True)
         for name, svg in self.plots.items():
@@ -115,7 +116,7 @@ def share_cell(value: float, ends: tuple[float, float]) -> Figure:
 
 def processor() -> str:
     """The name of the processor."""
-    info = FilePath("/proc/cpuinfo")
+    info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     names = (line.split(": ")[1] for line in lines if line.startswith("model name"))
     return next(names, platform.processor())
@@ -182,8 +183,7 @@ def histograms(panels: Histograms, across: int) -> str:
         for axes, (label, (bins, parts)) in zip(grid.flat, panels.items(), strict=False):
             for name, values in parts.items():
                 weights = np.full(len(values), 100 / max(len(values), 1))
-                inside = values.clip(bins[0], bins[-1])
-                axes.hist(inside, bins, weights=weights, histtype="step", label=name)
+                axes.hist(values.clip(bins[0], bins[-1]), bins, weights=weights, histtype="step", label=name)
             axes.set_xlabel(label)
             axes.yaxis.set_major_formatter("{x:g}%")
         figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=5)

@@ -22,7 +22,7 @@ from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError, check_name, needs
-from robotdiffuse.core.output_files import lock_folder
+from robotdiffuse.core.files import lock_folder
 from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Settings, SettingsOf, Share
 from robotdiffuse.core.types import Configurations, Path, interpolated
@@ -43,8 +43,7 @@ from robotdiffuse.planning.search.shared_tree import SharedTreeSearch, SharedTre
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.family import POSE, POSITION, Family, SampledProblem
 from robotdiffuse.problems.families.scaled import family_for
-from robotdiffuse.processes.ray_cluster import CLUSTERS
-from robotdiffuse.processes.workers import Results, on_this_machine
+from robotdiffuse.processes.workers import CLUSTERS, Results, on_this_machine
 from robotdiffuse.robots import load_robot, names_a_file
 from robotdiffuse.robots.robot import Robot, robot_fingerprint
 from robotdiffuse.scenes.scene_arrays import PackedScenes
@@ -91,7 +90,7 @@ class GenerationSettings(Settings):
     distribution."""
     target: Annotated[str, OneOf(TARGETS)] = POSITION
     """Whether a target is a position of the tip, as in the paper, or a pose. Families of furniture always use
-    the pose."""
+    the pose. Arms with fewer than six joints always reach the position only."""
     goals: Annotated[int, Bound(least=1.0, most=127.0)] = 10
     """Largest number of goal configurations of a target, found by inverse kinematics (the paper's k)."""
     waypoints: Annotated[int, Bound(least=2.0)] = 254
@@ -278,8 +277,9 @@ def generate(
     trajectories that are done and the number of all.
 
     Raises InputError for `workers` below 1 and an unknown cluster, if the folder's data have other settings
-    or are of another version or robot, if the folder cannot be written or another process is filling it, and
-    in the cases in which `make_shard` raises it.
+    or are of another version or robot, if the folder holds shards without a manifest, cannot be written or is
+    being filled by another process, if a node of the cluster has other versions or another robot, and in the
+    cases in which `make_shard` raises it.
     """
     if workers < 1:
         raise InputError(f"workers is {workers}; it must be at least 1")

@@ -8,7 +8,7 @@ written atomically.
 import copy
 import hashlib
 import json
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -17,7 +17,7 @@ from safetensors.torch import load, save
 from torch import nn
 
 from robotdiffuse.core.errors import InputError, described
-from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.files import JsonObject, write_atomically
 from robotdiffuse.learning.completion_network import CompletionNetwork
 from robotdiffuse.learning.encoders import ENCODERS, encoder_name
 from robotdiffuse.learning.encoders.networks import Encoder
@@ -44,19 +44,19 @@ def fingerprint(module: nn.Module) -> str:
     return digest.hexdigest()[:16]
 
 
-def save_network(name: str, network: Any, folder: str | FilePath, training: dict[str, Any]) -> None:
+def save_network(name: str, network: Any, folder: str | Path, training: JsonObject) -> None:
     """Write NAME.safetensors, NAME.json and the ONNX files; `name` as in NETWORKS, or "encoder".
 
     training: information for people, such as the data's fingerprint and the number of samples.
     """
-    about: dict[str, Any] = {"network": encoder_name(network) if isinstance(network, Encoder) else name}
+    about: JsonObject = {"network": encoder_name(network) if isinstance(network, Encoder) else name}
     if isinstance(network, Network):
         about["robot"] = network.robot.to_json()
     about |= {"settings": network.settings.to_json(), "training": training}
-    _save(network, FilePath(folder), name, about)
+    _save(network, Path(folder), name, about)
 
 
-def _save(module: SavedModule, folder: FilePath, stem: str, about: dict[str, Any]) -> None:
+def _save(module: SavedModule, folder: Path, stem: str, about: JsonObject) -> None:
     """Write STEM.safetensors, the ONNX files, and last STEM.json with the SHA-256 of these files."""
     # weight matrices of layers in fp16, other tensors unchanged
     kinds = (nn.Linear, nn.Conv3d)
@@ -75,7 +75,7 @@ def _save(module: SavedModule, folder: FilePath, stem: str, about: dict[str, Any
     write_atomically(folder / f"{stem}.json", json.dumps(about, indent=1) + "\n", make_folder=True)
 
 
-def _load(name: str, folder: FilePath) -> Any:
+def _load(name: str, folder: Path) -> Any:
     """The network of a folder, frozen. Raises InputError if a file is missing or damaged."""
     about = read_description(folder, name)
     location = f"{folder / name}.json"
@@ -102,12 +102,12 @@ def _load(name: str, folder: FilePath) -> Any:
     return network.float().requires_grad_(False).eval()
 
 
-def load_encoder(folder: str | FilePath) -> Encoder:
+def load_encoder(folder: str | Path) -> Encoder:
     """The trained encoder of a folder, frozen. Raises InputError if it is missing or damaged."""
-    return _load("encoder", FilePath(folder))
+    return _load("encoder", Path(folder))
 
 
-def load_completion(folder: str | FilePath | None = None) -> CompletionNetwork:
+def load_completion(folder: str | Path | None = None) -> CompletionNetwork:
     """The occupancy completion network of a folder, frozen; None: the network that comes with the package.
 
     Raises InputError for damaged files, and if there is no network, naming the command that trains it.
@@ -115,7 +115,7 @@ def load_completion(folder: str | FilePath | None = None) -> CompletionNetwork:
     return _load("completion", completion_folder(folder))
 
 
-def load_network(name: str, folder: str | FilePath | None, robot: Robot) -> Any:
+def load_network(name: str, folder: str | Path | None, robot: Robot) -> Any:
     """The trained network of the folder that `weights_folder` finds, ready to use.
 
     Raises InputError if there is no network, naming the command that trains it, and for files that are
@@ -130,12 +130,12 @@ def load_network(name: str, folder: str | FilePath | None, robot: Robot) -> Any:
 _loaded = kept_by_stamp(_load)
 
 
-def export_weights(folder: str | FilePath) -> list[str]:
+def export_weights(folder: str | Path) -> list[str]:
     """Export all networks in a folder again from their weights. Returns the names of the networks.
 
     Raises InputError if the folder holds no network, or a damaged one.
     """
-    place = FilePath(folder)
+    place = Path(folder)
     written = list[str]()
     for name in NETWORKS:
         if not (place / f"{name}.json").is_file():

@@ -8,7 +8,7 @@ Nothing here loads PyTorch. The network itself is in `completion_network`.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -28,9 +28,9 @@ from robotdiffuse.learning.weight_files import (
 )
 from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 from robotdiffuse.perception.observed_volume import ObservedVolume, observe
+from robotdiffuse.perception.occupancy_map import LOST_PROBABILITY, lost_regions
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.seen_points import near_scene
-from robotdiffuse.perception.unknown_space import LOST_PROBABILITY, lost_regions
 from robotdiffuse.perception.voxel_grid import COARSE, FINE, SHAPE
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.families.family import Range, base_spheres
@@ -236,8 +236,9 @@ def predict(volume: ObservedVolume, network: Completion | None = None) -> Float3
     """The probability that each voxel of 2 cm holds an obstacle.
 
     It is 0 in voxels that were seen free. It is also 0 farther than 1 m from a Panda's shoulder, since
-    training did not cover these voxels. In lost regions, which the network mistakes for free space, it is at
-    least LOST_PROBABILITY. The lower corner of the grid is `voxel_grid.LOW`, in the base frame.
+    training did not cover these voxels. In lost regions (see `ObservedVolume.lost`),
+    which the network mistakes for free space, it is at least LOST_PROBABILITY. The lower corner of the grid
+    is `voxel_grid.LOW`, in the base frame.
     network: None: the network that comes with the package.
     """
     return np.maximum(
@@ -246,7 +247,7 @@ def predict(volume: ObservedVolume, network: Completion | None = None) -> Float3
     )
 
 
-def exported_completion(folder: str | FilePath | None = None) -> Completion:
+def exported_completion(folder: str | Path | None = None) -> Completion:
     """The network of a folder, loaded once, and again if it was trained anew; None: the network that comes
     with the package.
 
@@ -256,7 +257,7 @@ def exported_completion(folder: str | FilePath | None = None) -> Completion:
 
 
 @kept_by_stamp
-def _exported(name: str, folder: FilePath) -> Completion:
+def _exported(name: str, folder: Path) -> Completion:
     from robotdiffuse.learning.exported_model import OnnxNetwork  # imports ONNX Runtime
 
     parts = exported_files(folder, name, read_description(folder, name))

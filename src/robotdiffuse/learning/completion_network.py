@@ -28,7 +28,7 @@ CHANNELS = 7
 """Number of input channels: occupied, free, shadow of the arm, out of view, depth behind a surface, height,
 distance from the base's axis."""
 DEPTH_SCALE = DEPTH_STEP / 0.5
-"""Depths behind surfaces are stored as multiples of DEPTH_STEP; times this, half a meter becomes 1."""
+"""Depths behind surfaces are stored as multiples of DEPTH_STEP. This factor scales half a meter to 1."""
 
 
 def _position_inputs() -> Float[Tensor, "28 28 16 16"]:
@@ -39,7 +39,7 @@ def _position_inputs() -> Float[Tensor, "28 28 16 16"]:
 
 
 def folded(x: Shaped[Tensor, "n i j k"]) -> Shaped[Tensor, "n i//2 j//2 k//2 8"]:
-    """Voxels grouped into cells of 2 x 2 x 2; the last axis is the index in the cell, 4 x + 2 y + z."""
+    """Voxels grouped into cells, two along each axis. The last axis is the index in the cell, 4x + 2y + z."""
     n, i, j, k = x.shape
     cells = x.reshape(n, i // 2, 2, j // 2, 2, k // 2, 2).permute(0, 1, 3, 5, 2, 4, 6)
     return cells.reshape(n, i // 2, j // 2, k // 2, 8)
@@ -128,7 +128,7 @@ class CompletionNetwork(SavedModule):
 
     def exports(self) -> dict[str, bytes]:
         """The bytes of the ONNX file of `probabilities`, for one volume."""
-        # two tensors, because the exporter would take one shared tensor for one input
+        # separate tensors: the exporter would merge two names of one tensor into one input
         inputs = {name: torch.zeros(SHAPE, dtype=torch.uint8) for name in ("seen", "behind")}
         return {".onnx": exported(self, self._probabilities_of_one, inputs, {})}
 

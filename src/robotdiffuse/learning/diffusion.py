@@ -87,12 +87,12 @@ class NoiseSchedule:
 def noise_factor(
     residuals: Float[ndarray, "n waypoints dof"], smooth: bool
 ) -> Float[ndarray, "waypoints waypoints"]:
-    """The matrix L that turns white noise e into the noise L e of the forward process, which is zero at the
-    first and the last waypoint and has a mean variance of 1 between them.
+    """The matrix L that turns white noise e into the noise L e of the forward process. This noise is zero at
+    the first and the last waypoint, and its mean variance between them is 1.
 
-    residuals: trajectories relative to their reference, scaled to unit variance. smooth: whether L Lᵀ is the
-    covariance of the residuals over the waypoints, plus a little white noise so that it has full rank;
-    otherwise L is `white_noise_factor`.
+    residuals: trajectories relative to their reference, scaled to unit variance. smooth: if true, L Lᵀ is the
+    covariance of the residuals over the waypoints, plus a little white noise so that it has full rank; if
+    false, L is `white_noise_factor`.
     """
     waypoints = residuals.shape[1]
     white = white_noise_factor(waypoints)

@@ -1,6 +1,6 @@
 """The trained diffusion model as planning runs it: by ONNX Runtime, without PyTorch."""
 
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 import onnxruntime
@@ -62,7 +62,7 @@ class OnnxNetwork:
 class ExportedModel(MotionModel):
     """The model of a folder with weights."""
 
-    def __init__(self, name: str, folder: FilePath) -> None:
+    def __init__(self, name: str, folder: Path) -> None:
         """name: "model" or "trajectory_prior". Raises InputError, naming the file, for a missing or damaged
         file."""
         about = read_description(folder, name)
@@ -118,8 +118,9 @@ class ExportedModel(MotionModel):
         return self._encoder(cloud=cloud[None])[0]
 
 
-def exported_model(name: str, folder: str | FilePath | None, robot: Robot) -> MotionModel:
-    """The model of a folder, loaded once; None: the user's own or the bundled weights for the robot.
+def exported_model(name: str, folder: str | Path | None, robot: Robot) -> MotionModel:
+    """The model of `folder`, loaded once; if `folder` is None, of the user's own or the bundled weights for
+    the robot.
 
     name: "model" or "trajectory_prior". Raises InputError if there is no model, naming the command that
     trains it, and for files that are damaged or made for another robot.

@@ -15,9 +15,10 @@ contact (a Gauss-Newton step), and a kernel spreads the pushes over the neighbor
 of CHOMP does (Zucker et al., IJRR 2013). The cost of length is CHOMP's smoothness; its
 step moves each waypoint towards the middle of its two neighbors.
 
-A problem's path constraints are one more cost: the sum of h^2 / 2 over their rows (scalar constraints), where
-h [m] is how far the value of a row exceeds its limit, less the part 1 - `tolerance_share` of its tolerance; a
-radian counts as `projection_kernel.ANGLE_WEIGHT` meters.
+A problem's path constraints are one more cost: the sum of h^2 / 2 over their rows (scalar constraints) that
+exceed their limits, which are lowered by (1 - `tolerance_share`) times the tolerance. h [m] is the difference
+to the value within the limit that projection aims for (`projection_kernel`). A radian counts as
+`projection_kernel.ANGLE_WEIGHT` meters.
 """
 
 from dataclasses import dataclass
@@ -121,8 +122,8 @@ def _push_away(cost, gradient, push, out):
 
 @allocation_free(fastmath=True)
 def _spread(q, first, last, pushes, active, spread_weights, lower, upper):
-    """Moves each of the waypoints `first` to `last` - 1 by a weighted mean of its neighbors' pushes; by less
-    if only distant neighbors are pushed."""
+    """Moves each of the waypoints `first` to `last` - 1 by a weighted mean of its own push and those of its
+    neighbors; by less if only distant neighbors are pushed."""
     dof = q.shape[1]
     for i in range(first, last):
         weight = _ZERO
@@ -204,7 +205,7 @@ class CollisionGuidance:
         moved = np.array(q, np.float32)
         lower, upper = (limits.astype(np.float32) for limits in (checker.robot.lower, checker.robot.upper))
         compiled = Steps(
-            margin=OFF if settings.margin is None else np.float32(settings.margin) + checker.padding,
+            margin=OFF if settings.margin is None else np.float32(settings.margin),
             self_margin=OFF if settings.self_margin is None else np.float32(settings.self_margin),
             push=np.float32(settings.push),
             spread_weights=spread,
@@ -224,8 +225,8 @@ class CollisionGuidance:
 
 @kernel(nogil=True)
 def _towards_constraints(rows, limits, q, max_step):
-    """Moves each configuration of q [n, dof] that exceeds its limits by a damped Newton step towards values
-    within them, in place; max_step: longest step [rad]."""
+    """Moves each configuration of q [n, dof] whose rows exceed the limits, in place, by one damped Newton
+    step towards values within them; max_step: longest step [rad]."""
     work = make_work(rows)
     for i in range(len(q)):
         step(rows, limits, q[i], max_step, work)

@@ -85,7 +85,8 @@ class SamplingSettings(Settings, name="sampling"):
     sampler: Annotated[str, OneOf(SAMPLERS)] | None = None
     """Name in `learning.diffusion.SAMPLERS`; None: the sampler that is stored with the weights."""
     eta: Share = 0.0
-    """Amount of new noise in each denoising step: 0 is DDIM, 1 is ancestral sampling."""
+    """Amount of new noise in each denoising step: 0 is DDIM, 1 is ancestral sampling. Ignored by the sampler
+    ddpm, for which it is 1."""
     guided_share: Share = 0.5
     """Share of the denoising steps that are guided; these are the last ones: 0 none, 1 all (the paper's)."""
     guidance_scale: float = 1.0
@@ -196,7 +197,7 @@ class MotionModelSettings(ModelParts, name="model"):
 
     @property
     def code(self) -> int:
-        """Size of z."""
+        """Size of z, the embedding of the scene; 0 without an encoder."""
         return 0 if self.encoder_settings is None else self.encoder_settings.code
 
 
@@ -339,8 +340,8 @@ class MotionModel(ABC):
         start: Joints,
         goal: Joints,
     ) -> Float[ndarray, "*batch condition"]:
-        """C = [z, start, goal]; start and goal are normalized. Without an encoder, C is a single zero: the
-        condition of a denoiser must not be empty."""
+        """C = [z, start, goal], where this function normalizes start and goal [rad]. Without an encoder, C is
+        a single zero: the condition of a denoiser must not be empty."""
         if self.settings.encoder is None:
             return np.zeros((*np.shape(start)[:-1], 1), np.float32)
         ends = [self._unit(q) for q in (start, goal)]

@@ -32,8 +32,8 @@ def block_means(
     waypoints: int, block: int
 ) -> tuple[Float[Tensor, "blocks waypoints"], Float[Tensor, "waypoints blocks"], Float[ndarray, "blocks"]]:
     """The matrix that takes means of blocks of waypoints, the matrix that interpolates linearly between the
-    middles of the blocks, and these middles [waypoints]. The first and the last waypoint are blocks of their
-    own; `block` must divide waypoints - 2."""
+    middles of the blocks, and these middles as indices of waypoints. The first and the last waypoint are
+    blocks of their own; `block` must divide waypoints - 2."""
     index = np.r_[0, 1 + np.arange(waypoints - 2) // block, 1 + (waypoints - 2) // block]
     member = np.eye(index[-1] + 1)[:, index]
     means = member / member.sum(1, keepdims=True)

@@ -262,8 +262,7 @@ class MPiNetsNetwork(BaselineNetwork):
 
     def fit_statistics(self, data: TrajectoryData) -> None:
         """Set the size of the experts' steps."""
-        motions = data.q[:20_000]
-        steps = np.diff(self.normalizer.to_unit(motions), axis=1)
+        steps = np.diff(self.normalizer.to_unit(data.q[:20_000]), axis=1)
         size = np.sqrt(np.square(steps).mean((0, 1)))
         self.step.copy_(torch.from_numpy(np.maximum(size, 1e-4)))
 

@@ -76,7 +76,7 @@ class MPNetSettings(Settings, name="mpnet"):
     code: Count = 60
     """Size of z (paper: 28, for scenes in two dimensions)."""
     contraction: NotNegative = 1e-3
-    """lambda, the weight of the contractive penalty [m^2]."""
+    """lambda, the weight of the contractive penalty [m^4]."""
     layers: Sizes = (768, 640, 512, 384, 320, 256, 192, 128, 128, 64, 32)
     """Widths of Pnet's layers (paper: 1280, 1024, 896, 768, 512, 384, 256, 256, 128, 64, 32)."""
     dropout: Annotated[float, Bound(least=0.0, below=1.0)] = 0.25
@@ -93,7 +93,8 @@ class MPNetSettings(Settings, name="mpnet"):
         super().__post_init__()
         if self.steady_layers > len(self.layers):
             raise InputError(
-                f"mpnet.steady_layers is {self.steady_layers}; Pnet has {len(self.layers)} layers"
+                f"mpnet.steady_layers is {self.steady_layers}; it must be at most {len(self.layers)}, "
+                "the number of mpnet.layers"
             )
 
 
@@ -123,8 +124,7 @@ class MPNetNetwork(BaselineNetwork):
         """Set the unit of Pnet's output: the root mean square of the steps between waypoints."""
         if len(data):
             rng = np.random.default_rng(0)
-            rows = data.draw(5_000, TRIVIAL_SHARE, rng)
-            current, following, _ = self.training_samples(data.q[rows], rng)
+            current, following, _ = self.training_samples(data.q[data.draw(5_000, TRIVIAL_SHARE, rng)], rng)
             step = self.normalizer.to_unit(following) - self.normalizer.to_unit(current)
             self.step_scale.fill_(max(float(np.sqrt(np.mean(step**2))), 1e-3))
 

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from safetensors.numpy import load
 
 from robotdiffuse.collision.kernel_arrays import robot_groups
 from robotdiffuse.core.errors import InputError, joined, shortened
-from robotdiffuse.core.input_files import is_file, read_bytes, read_json
+from robotdiffuse.core.files import JsonObject, is_file, read_bytes, read_json
 from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.robots.kinematic_tree import JointNormalizer, once_per_robot
@@ -133,15 +133,15 @@ NETWORKS = Registry(
         ),
     },
 )
-"""The last value of an entry, its kind, is what follows `robotdiffuse train` in the command that trains the
-network. Entries without a kind are trained by `robotdiffuse train baseline NAME`."""
+"""The kind of an entry, its fourth value, is what follows `robotdiffuse train` in the command that trains the
+network. Entries without a fourth value are trained by `robotdiffuse train baseline NAME`."""
 
 
 FORMAT = 2
 """Version of the format of NAME.json."""
 
 
-def stamp(folder: FilePath, name: str) -> tuple[int, int] | None:
+def stamp(folder: Path, name: str) -> tuple[int, int] | None:
     """Modification time [ns] and inode of NAME.json, the file that training writes last; None if it is
     missing.
 
@@ -154,14 +154,14 @@ def stamp(folder: FilePath, name: str) -> tuple[int, int] | None:
     return status.st_mtime_ns, status.st_ino
 
 
-def kept_by_stamp(load: Callable[[str, FilePath], Any]) -> Callable[[str, FilePath], Any]:
+def kept_by_stamp(load: Callable[[str, Path], Any]) -> Callable[[str, Path], Any]:
     """Decorator of a function that loads a network by name and folder: caches the network until its
     NAME.json changes."""
     cached = lru_cache(maxsize=16)(lambda name, folder, _stamp: load(name, folder))
     return lambda name, folder: cached(name, folder, stamp(folder, name))
 
 
-def read_description(folder: FilePath, name: str) -> dict[str, Any]:
+def read_description(folder: Path, name: str) -> JsonObject:
     """The contents of NAME.json. Raises InputError if it is missing or damaged."""
     file = folder / f"{name}.json"
     try:
@@ -170,12 +170,15 @@ def read_description(folder: FilePath, name: str) -> dict[str, Any]:
         if not os.path.lexists(file):
             raise InputError(f"{folder} holds no trained model: {file.name} is missing") from None
         raise InputError(f"{file} is damaged: {error}") from None
-    if not isinstance(about, dict) or about.get("format") != FORMAT:
-        raise InputError(f"{file} is not a model description of format {FORMAT}")
+    version = about.get("format") if isinstance(about, dict) else None
+    if version != FORMAT:
+        raise InputError(
+            f"{file} is no model description: format is {shortened(version)}; it must be {FORMAT}"
+        )
     return about
 
 
-def checked_bytes(file: FilePath, digest: object, description: str) -> bytes:
+def checked_bytes(file: Path, digest: object, description: str) -> bytes:
     """The contents of a file. Raises InputError if it cannot be read or its SHA-256 is not that of the
     description."""
     data = read_bytes(file, "weight file")
@@ -184,7 +187,7 @@ def checked_bytes(file: FilePath, digest: object, description: str) -> bytes:
     return data
 
 
-def exported_files(folder: FilePath, name: str, about: dict[str, Any]) -> dict[str, bytes]:
+def exported_files(folder: Path, name: str, about: JsonObject) -> dict[str, bytes]:
     """The exported parts of a network by their ending. Raises InputError if there are none or one is
     damaged."""
     digests = about.get("onnx_sha256")
@@ -199,9 +202,7 @@ def exported_files(folder: FilePath, name: str, about: dict[str, Any]) -> dict[s
     }
 
 
-def read_arrays(
-    folder: FilePath, name: str, about: dict[str, Any], keys: Iterable[str]
-) -> dict[str, ndarray]:
+def read_arrays(folder: Path, name: str, about: JsonObject, keys: Iterable[str]) -> dict[str, ndarray]:
     """The tensors of NAME.safetensors with these names, without those that the file lacks. Raises InputError
     if the file cannot be read."""
     file = folder / f"{name}.safetensors"
@@ -213,18 +214,18 @@ def read_arrays(
     return {key: tensors[key] for key in keys if key in tensors}
 
 
-BUNDLED = FilePath(__file__).parent / "weights"
+BUNDLED = Path(__file__).parent / "weights"
 """Folder of the weights that come with the package; a robot's weights are in the subfolder with its name."""
 POINTS = "panda_points"
 """Subfolder with the weights of the config `points`, whose network has no clearances as inputs."""
 
 
-def user_weights(robot: Robot) -> FilePath:
+def user_weights(robot: Robot) -> Path:
     """The folder of weights that the user trained for a robot, in the user's data folder."""
     return user_robots() / robot.name / "weights"
 
 
-def weights_for(name: str, robot: Robot) -> FilePath | None:
+def weights_for(name: str, robot: Robot) -> Path | None:
     """The folder with weights of a network (a name in NETWORKS) for exactly this robot; None if there is
     none.
 
@@ -238,28 +239,29 @@ def weights_for(name: str, robot: Robot) -> FilePath | None:
 
 
 @kept_by_stamp
-def identity(name: str, folder: FilePath) -> RobotIdentity:
+def identity(name: str, folder: Path) -> RobotIdentity:
     """The robot that weights were trained for. Raises InputError for a damaged description."""
     about = read_description(folder, name)
     return RobotIdentity.from_json(about.get("robot"), f"{folder / name}.json: robot")
 
 
-def folder_of(folder: str | FilePath) -> FilePath:
+def folder_of(folder: str | Path) -> Path:
     """The folder that the argument denotes: an existing path, else the name of a bundled folder of
     weights."""
-    place = FilePath(folder)
+    place = Path(folder)
     return place if os.path.exists(place) or not os.path.isdir(BUNDLED / folder) else BUNDLED / folder
 
 
-def check_weights(name: str, folder: str | FilePath | None) -> None:
+def check_weights(name: str, folder: str | Path | None) -> None:
     """Raises InputError if the given folder holds no weights of this network; None is accepted."""
     NETWORKS.entry(name)
     if folder is not None and not is_file(folder_of(folder) / f"{name}.json"):
-        message = f"{folder} holds no {name}" if os.path.isdir(folder) else f"there are no weights {folder}"
+        exists = os.path.isdir(folder_of(folder))
+        message = f"{folder} holds no {name}" if exists else f"there are no weights {folder}"
         raise no_weights_error(name, message)
 
 
-def weights_folder(name: str, folder: str | FilePath | None, robot: Robot) -> FilePath:
+def weights_folder(name: str, folder: str | Path | None, robot: Robot) -> Path:
     """The folder with weights of a network: the given folder, the folder from `weights_for`, or the bundled
     one of another arm with the robot's name.
 
@@ -276,7 +278,7 @@ def weights_folder(name: str, folder: str | FilePath | None, robot: Robot) -> Fi
     raise no_weights_error(name, f"no weights of the network {name} come with the package for {robot.name}")
 
 
-def completion_folder(folder: str | FilePath | None) -> FilePath:
+def completion_folder(folder: str | Path | None) -> Path:
     """The folder with weights of the completion network, which belong to no robot: the given folder, or the
     package's.
 

@@ -1,4 +1,5 @@
-"""Worker processes on this machine: each runs one call at a time, and is killed if the call takes too long.
+"""Worker processes on this machine (each runs one call at a time, and is killed if the call takes too long),
+and calls on a Ray cluster.
 
 Only the process that the user started handles Ctrl-C; it ends its workers. Workers also exit when their
 parent dies, even if it is killed.
@@ -6,11 +7,13 @@ parent dies, even if it is killed.
 
 import atexit
 import fcntl
+import logging
 import multiprocessing
 import os
 import pickle
 import queue
 import signal
+import socket
 import sys
 import threading
 import time
@@ -26,12 +29,15 @@ from pathlib import Path
 from typing import Any
 from weakref import WeakSet
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse import __version__
+from robotdiffuse.core.errors import InputError, needs
 from robotdiffuse.core.interrupts import delay_interrupts
-from robotdiffuse.core.registry import added_entries, adopt_entries
+from robotdiffuse.core.registry import AddedEntries, added_entries, adopt_entries
 
 Results = Generator[tuple[int, Any], None, None]
-"""Results in order of completion, each with the index of its call. Close the generator to stop the calls."""
+"""Results in order of completion, each with the index of its call. After it is closed, the generator submits
+no more calls. Calls that run are stopped with their processes or with the cluster that was connected for
+them."""
 TERMINATE_TIMEOUT = 5.0
 """Time from asking a process to end until it is killed [s]."""
 PREPARE_TIMEOUT = 600.0
@@ -97,7 +103,8 @@ def _nothing() -> None:
 
 
 class Worker:
-    """A process that runs one call at a time. It starts with the first call, and again after it ended."""
+    """A process that runs one call at a time. It starts with the first call. If it ends during a call, the
+    call raises EndedError, and the next call starts a new process."""
 
     busy = False
     """Whether `Workers` runs a call in it."""
@@ -121,6 +128,8 @@ class Worker:
 
         Raises NotStartedError if it cannot start, EndedError if it ends while it prepares or is closed.
         """
+        if self._running is not None and not self._running[0].is_alive():  # killed between two calls
+            self.end(0.0)
         if self._running is None and self._start() is True:
             self.end(0.0)
             self._start()
@@ -162,8 +171,8 @@ class Worker:
         stop: called every CHECK_INTERVAL; once it returns True, `cancelled` is true in the process, which is
         killed if the call does not end within CANCEL_TIMEOUT.
 
-        Raises EndedError if the process ends or is closed, OverrunError after the timeout, and
-        NotStartedError if it could not start.
+        Raises EndedError if the process ends or is closed, OverrunError after the timeout or CANCEL_TIMEOUT,
+        and NotStartedError if it could not start.
         """
         message = pickle.dumps((call, arguments))
         self.start()
@@ -191,13 +200,17 @@ class Worker:
                     answer, renew = connection.recv()
                     if not isinstance(answer, float):
                         break
-                    # not a result, but the time that the call may still take, from `allow`
-                    due = time.monotonic() + answer
+                    # not a result, but the time that the call may still take, from `allow`; a cancelled call
+                    # gets no more
+                    if not stop_sent:
+                        due = time.monotonic() + answer
         except (EOFError, OSError):
             process.join(TERMINATE_TIMEOUT)
             self.end(0.0)
             code = process.exitcode or 0
-            exit_text = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit status {code}"
+            names = {number.value: number.name for number in signal.Signals}
+            killed_by = names.get(-code, f"signal {-code}")  # most real-time signals have no name
+            exit_text = f"by {killed_by}" if code < 0 else f"with exit status {code}"
             raise EndedError("closed" if self._closed else exit_text) from None
         if renew:
             self.end(0.0)
@@ -348,6 +361,9 @@ class Workers:
         """The future of `call(*arguments)` in the next idle process; its exceptions are those of
         `Worker.call`."""
         submitted = Call(call, arguments, timeout)
+        if self._closed:
+            _fail(submitted, EndedError("closed"))
+            return submitted
         if not self._begun:
             self.start()
         self._calls.put(submitted)
@@ -375,7 +391,7 @@ class Workers:
         """Results of `call(*arguments)` for each of `calls`.
 
         The number of calls that run or wait is at most the number of processes plus one. Raises InputError if
-        a process is killed from outside, e.g. when memory runs out.
+        a process cannot be started, ends itself, or is killed from outside, e.g. when memory runs out.
         """
         pending = list(enumerate(calls))[::-1]
         running = {}
@@ -423,7 +439,7 @@ def block_interrupts_in_children() -> Iterator[None]:
 
     Only the parent handles Ctrl-C then, even while the children are still importing.
     """
-    resource_tracker.ensure_running()  # else the first process starts it and unblocks the signal
+    resource_tracker.ensure_running()  # else starting the first process starts it, which unblocks SIGINT
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -431,7 +447,7 @@ def block_interrupts_in_children() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-# In the process
+# Code that runs in the worker process
 
 
 class _Process:
@@ -476,15 +492,15 @@ _this: _Process | None = None
 def _main(connection: Connection) -> None:
     global _this
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    # as in other processes: locks of packages, such as tqdm, then leave nothing behind that Python would warn
-    # of when this process is ended
+    # Reset "spawn" to the system's default. With "spawn", a lock, such as that of tqdm, is registered with
+    # Python's resource tracker, which would warn of it when this process is killed.
     multiprocessing.set_start_method(None, force=True)
     _exit_by_signal_with_parent()
     _this = _Process(connection)
     threading.Thread(target=_this.receive, daemon=True).start()
     try:
         _this.send(0.0)  # the message for which `Worker._start` waits
-        _, message = _this.calls.get()
+        _this.running, message = _this.calls.get()
         entries, prepare, arguments = pickle.loads(message)
         adopt_entries(entries)
         _this.send(pickle.dumps((prepare(*arguments), None)))
@@ -500,7 +516,9 @@ def _main(connection: Connection) -> None:
 def _failure(error: BaseException) -> bytes:
     error.add_note("in a worker process:\n" + "".join(traceback.format_exception(error)))
     try:
-        return pickle.dumps((None, error))
+        answer = pickle.dumps((None, error))
+        pickle.loads(answer)  # fails if the error's constructor takes other arguments
+        return answer
     except Exception:
         return pickle.dumps((None, RuntimeError(f"{type(error).__name__}: {error}")))
 
@@ -532,3 +550,93 @@ def renew() -> None:
     """End this worker process after the call that it runs."""
     if _this is not None:
         _this.renew = True
+
+
+CONNECT_TIMEOUT = 5.0
+"""Time for a Ray cluster to answer [s]; Ray itself would try for minutes."""
+MAX_RETRIES = 20
+"""Largest number of times that a call is repeated on a Ray cluster after the loss of its node, or after its
+process has died."""
+
+
+def on_ray(call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
+    """Run the calls on a Ray cluster, one core each; calls of a lost node or process are repeated.
+
+    See `ray_cluster`. Each node needs this package and, under the same paths, the files that the calls read.
+    """
+    pending = list(enumerate(calls))[::-1]
+    running = {}
+    with ray_cluster() as ray:
+        task = ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(_on_node)
+        while pending or running:
+            max_running = 2 * max(1, int(ray.cluster_resources().get("CPU", 0)))
+            while pending and len(running) < max_running:
+                number, arguments = pending.pop()
+                running[task.remote(added_entries(), call, arguments)] = number
+            finished, _ = ray.wait(list(running), num_returns=1)
+            for reference in finished:
+                yield running.pop(reference), ray.get(reference)
+
+
+def _on_node(entries: AddedEntries, call: Callable[..., Any], arguments: tuple) -> Any:
+    adopt_entries(entries)
+    return call(*arguments)
+
+
+CLUSTERS: dict[str, Callable[[Callable[..., Any], Sequence[tuple]], Results]] = {"ray": on_ray}
+"""Cluster backends by the name that --cluster takes."""
+
+
+@contextmanager
+def ray_cluster() -> Iterator[Any]:
+    """The module ray, connected to the cluster at RAY_ADDRESS; without RAY_ADDRESS, to the cluster that was
+    last started on this machine, else to a new local one with all cores. A connection that the program has
+    already made is used, and kept.
+
+    Raises InputError if Ray is not installed, if its cluster cannot be reached or fails, if a task raises
+    InputError, and if a node lacks this package.
+    """
+    # Ray reads these variables on import. The first hides its page-long messages about a lost node.
+    os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "Raylet is terminated")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    with needs("ray", "cluster"):
+        import ray
+        from ray.exceptions import RayError, RayTaskError
+    started_here = not ray.is_initialized()
+    if started_here:
+        _check_reachable(os.environ.get("RAY_ADDRESS", ""))
+    connected = False
+    try:
+        if started_here:
+            ray.init(log_to_driver=False, logging_level=logging.CRITICAL)
+        connected = True
+        yield ray
+    except RayTaskError as error:
+        if isinstance(error.cause, InputError):
+            raise type(error.cause)(str(error.cause)) from None
+        if "No module named 'robotdiffuse'" in str(error):
+            raise InputError(
+                f"a node of the Ray cluster cannot import robotdiffuse; install {__version__} on every node"
+            ) from None
+        raise
+    except RayError as error:
+        raise InputError(f"the Ray cluster failed: {error}; {RERUN_HINT}") from None
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        if connected:
+            raise
+        raise InputError(f"no Ray cluster: {error}") from None
+    finally:
+        if started_here:
+            ray.shutdown()
+
+
+def _check_reachable(address: str) -> None:
+    """Raises InputError if nothing listens at the address HOST:PORT or ray://HOST:PORT. Other addresses are
+    not checked."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdecimal():
+        return
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), CONNECT_TIMEOUT).close()
+    except (OSError, OverflowError) as error:
+        raise InputError(f"no Ray cluster at {address}, the value of RAY_ADDRESS: {error}") from None

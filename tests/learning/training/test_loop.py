@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 import torch
@@ -36,6 +35,13 @@ def test_steps_that_are_not_finite_are_counted_beyond_an_interruption(tmp_path: 
     refuses("not finite at step 3", run_of(tmp_path, lambda call: float("nan")).step)
 
 
+def test_other_data_are_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    run_of(tmp_path, lambda call: 1.0).save()
+    monkeypatch.setattr(ToyTask, "about", lambda self: {"data": "others"})
+    run_of(tmp_path, lambda call: 1.0)
+    assert "training.safetensors was trained on other data; the training goes on" in capsys.readouterr().err
+
+
 def test_a_checkpoint_that_a_killed_run_left_half_written_is_removed(tmp_path: Path) -> None:
     """Regression: each kill while a checkpoint was written left a file of its size for ever."""
     (tmp_path / ".training.safetensors.0123456789abcdef.tmp").write_bytes(b"half")
@@ -43,13 +49,14 @@ def test_a_checkpoint_that_a_killed_run_left_half_written_is_removed(tmp_path: P
     assert not list(tmp_path.glob(".*"))
 
 
-def test_a_training_goes_on_without_plots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Regression: TensorBoard's error on a full disk ended the training."""
-    pytest.importorskip("tensorboard")
-    monkeypatch.setattr("torch.utils.tensorboard.SummaryWriter", Mock(side_effect=OSError))
-    run = run_of(tmp_path, lambda call: 1.0)
-    run.loop()
-    assert run.at.samples == 40
+def test_a_training_goes_on_without_plots(tmp_path: Path) -> None:
+    """Regression: TensorBoard's error on a full disk ended the training, and later printed the traceback of a thread."""
+    events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    for folder in (tmp_path / "plots", tmp_path):
+        run_of(folder, lambda call: 1.0).loop()
+        (tmp_path / "tensorboard").touch()
+    plotted = events.EventAccumulator(str(tmp_path / "plots" / "tensorboard")).Reload().Scalars("loss")
+    assert len(plotted) == len(read_log(tmp_path)) and plotted[-1].step == int(read_log(tmp_path)[-1]["samples"]) == 40
 
 
 def test_a_short_training_that_diverged_writes_no_weights(tmp_path: Path) -> None:

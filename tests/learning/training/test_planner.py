@@ -17,7 +17,7 @@ from helpers.refusals import refuses
 from helpers.small_model import SMALL_ENCODER, nothing_near
 from helpers.trainings import read_log
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.output_files import lock_folder
+from robotdiffuse.core.files import lock_folder
 from robotdiffuse.learning.checkpoint import load_encoder, load_network
 from robotdiffuse.learning.denoisers import DENOISERS, TransformerSettings, UNetSettings
 from robotdiffuse.learning.diffusion import OBJECTIVES

@@ -22,9 +22,8 @@ from robotdiffuse.learning.denoisers import (
 from robotdiffuse.learning.encoders.networks import OCTAVES, perceptron, wave_angles
 
 MAX_UNFUSED_TOKENS = 96
-"""On a CPU, attention in fp32 uses PyTorch's fused kernel only for more tokens than this; in bf16 it never
-uses the fused kernel. The limit is a compromise: at 66 tokens the
-fused kernel was faster, at 97 it was not.
+"""On a CPU, attention in fp32 uses PyTorch's fused kernel above this number of tokens; in bf16 never. No
+limit suits all rows: the fused kernel was faster at 66 tokens, slower at 97, and faster again at 255.
 
 Times of a forward and a backward pass [ms], torch 2.13, one thread:
 
@@ -124,7 +123,8 @@ class Denoiser(nn.Module, ABC):
     def __init__(self, settings: Any, waypoints: int, dof: int, features: int, condition: int) -> None:
         """settings: of the class that DENOISERS names for the denoiser.
         features: inputs per waypoint.
-        condition: size of [z, start, goal], in which start and goal have `dof` numbers each.
+        condition: size of [z, start, goal]. z is the scene's embedding, or its points if `settings.points`.
+            Start and goal have `dof` numbers each.
         """
         super().__init__()
         self.settings = settings
@@ -186,10 +186,12 @@ class Block(nn.Module):
 
 
 class TrajectoryTransformer(Denoiser):
-    """A transformer whose tokens are patches of waypoints. The class of its settings selects the variant:
+    """A transformer whose tokens are patches of waypoints. A further token, z_tk, carries the condition (z,
+    the embedding of the scene; start; goal) and the noise level t. The class of its settings selects the
+    variant:
 
-    - Encoder-only (the paper's motion predictor): a further token before those of the waypoints, z_tk,
-      carries the condition and the noise level. z_tk may also be added to every other token.
+    - Encoder-only (the paper's motion predictor): z_tk is before the tokens of the waypoints. It may also be
+      added to every other token.
     - Decoder-only (paper, Table 2; Radford et al. 2018): as encoder-only, with causal attention. z_tk is the
       first token, so all waypoints attend to it. One pass predicts all waypoints.
     - With points: z_tk carries start, goal and level, and is added to every other token; each block also
@@ -232,7 +234,8 @@ class TrajectoryTransformer(Denoiser):
         return nn.ModuleList(Block(*sizes, count, causal, cross) for _ in range(count))
 
     def set_positions(self, at: Float[ndarray, "tokens"]) -> None:
-        """Give the tokens other positions [waypoints]; the number of tokens may change."""
+        """Give the tokens other positions [waypoints], if patches have one waypoint. Their number may
+        change."""
         self.positions = positions(at, self.settings.width).to(self.positions.device)
 
     def forward(
@@ -255,7 +258,8 @@ class TrajectoryTransformer(Denoiser):
             z_tk = self.condition(condition) + self.level(level)
         if z_tk is not None:
             z_tk = z_tk[:, None]
-            x = torch.cat([z_tk.to(x.dtype), x + z_tk if self.adds_z_tk else x], 1)
+            waypoints = x + z_tk if self.adds_z_tk else x
+            x = torch.cat([z_tk.to(x.dtype), waypoints], 1)
         for block in self.blocks:
             x = block(x, memory)
         return self.out(self.norm(x[:, -count:])).float().reshape(batch, -1, self.dof)
@@ -314,9 +318,10 @@ class ResidualBlock(nn.Module):
 class UNet(Denoiser):
     """After Janner et al. 2022 and Carvalho et al. 2023 (MPD), with layer norms over the channels.
 
-    Each resolution has two residual blocks on the way down and two on the way up; the input of the latter
-    includes the features of this resolution from the way down. If the number of waypoints cannot be halved
-    often enough, the last waypoint is repeated, and the result is cut.
+    Each resolution except the coarsest has two residual blocks on the way down and two on the way up. The
+    first one on the way up also gets this resolution's features from the way down. The coarsest has two
+    blocks. If the number of waypoints cannot be halved often enough, the last waypoint is repeated, and the
+    result is cut.
     """
 
     def __init__(

@@ -32,7 +32,7 @@ class EncoderSettings(Settings, name="encoder"):
     """Points outside this region are ignored, since the arm does not reach them."""
 
     def prepared(self, points: Float32[ndarray, "n 3"]) -> Float32[ndarray, "m 3"]:
-        """Points within the region in the form that the exported encoder takes [m]."""
+        """The points, all of them within the region, in the form that the exported encoder takes [m]."""
         if self.ordered:
             return in_order(points, self.cloud)
         # padding points of zeros have no effect; the exported network needs at least one point, and without

@@ -48,7 +48,7 @@ class Encoder(SavedModule, ABC):
 
     @abstractmethod
     def forward(self, cloud: Cloud) -> Codes:
-        """z of each cloud [m], float32.
+        """z, float32, of each cloud of points [m].
 
         Points outside the region are ignored, so that clouds of different size can share a batch.
         """
@@ -129,8 +129,7 @@ def perceptron(*sizes: int, activation: Callable[[], nn.Module] | None = None) -
 
 def pool_max(features: Features, near: Near) -> Pooled:
     """Maximum feature over the points that count; zeros for clouds without any."""
-    low = torch.finfo(features.dtype).min
-    best = features.masked_fill(~near[..., None], low).amax(1)
+    best = features.masked_fill(~near[..., None], torch.finfo(features.dtype).min).amax(1)
     return best.masked_fill(~near.any(1, keepdim=True), 0.0)
 
 

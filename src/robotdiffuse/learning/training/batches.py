@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from numpy.random import Generator
 from torch import Tensor
 
 from robotdiffuse.core.errors import InputError, counted
-from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.files import write_atomically
 from robotdiffuse.core.types import Mask, Values
 from robotdiffuse.datasets.shards import SPLITS, read_rows, shard_indices, turns_about_vertical
 from robotdiffuse.datasets.surface_clouds import surface_clouds
@@ -33,9 +33,9 @@ Trajectories = Float[ndarray, "n waypoints dof"]
 def random_scenes(count: int, max_obstacles: int, rng: Generator, rop: bool = False) -> PackedScenes:
     """Random scenes for training an encoder.
 
-    They are of three groups in equal parts: two large obstacles as in ROP; up to `max_obstacles` obstacles
-    with the sizes of dense ROP; up to `max_obstacles` boxes and spheres of very different sizes, half of them
-    turned. rop: only scenes of the first group.
+    Each scene is of one of three kinds, with equal probability: two large obstacles as in ROP; up to
+    `max_obstacles` obstacles with the sizes of dense ROP; or up to `max_obstacles` boxes and spheres of very
+    different sizes, half of them turned. rop: only scenes of the first kind.
     """
     group = rng.integers(0, 1 if rop else 3, count)  # of each scene
     number = np.where(group == 0, 2, rng.integers(0, max_obstacles + 1, count))
@@ -70,7 +70,7 @@ class TrajectoryData:
     embeddings: Float[ndarray, "n embedding"] | None
     """Embedding z of each scene, float16; None if there is no frozen encoder."""
     digest: str
-    """The first 16 digits of the SHA-256 of the shards."""
+    """The first 16 digits of the SHA-256 of the shards' fingerprints."""
     validation: int
     """Number of rows of the validation split in the data of `load_data`. They come last; all other rows are
     of the training split."""
@@ -141,7 +141,7 @@ def load_data(
     for rows in read_rows(folder, robot, waypoints, turned_copies):
         fingerprints += [rows.shard.fingerprint] * (rows.turn == 0)
         key = f"{rows.shard.fingerprint}-{encoder_fingerprint}" + (f"-turn{rows.turn}" if rows.turn else "")
-        embeddings = _embeddings(FilePath(folder), rows.scenes, encoder, key)
+        embeddings = _embeddings(Path(folder), rows.scenes, encoder, key)
         for name, collected in parts.items():
             chosen = rows.split == SPLITS.index(name)
             collected.append(
@@ -165,7 +165,7 @@ def load_data(
 
 
 def _embeddings(
-    folder: FilePath,
+    folder: Path,
     scenes: PackedScenes,
     encoder: Encoder | None,
     key: str,
@@ -239,7 +239,9 @@ class Batch:
     base: Trajectories
     """`Reference.base` of the trajectories."""
     signal: Float[ndarray, "n 1 1"]
+    """Factor of the clean trajectory in `noisy`."""
     noise_level: Float[ndarray, "n 1 1"]
+    """Factor of the noise in `noisy`."""
     scenes: PackedScenes
 
 

@@ -115,7 +115,7 @@ class CompletionTraining(TrainingSettings):
     """Settings of the training of the completion network."""
 
     robot: str = "panda"
-    """Name of a bundled robot, or path to a URDF: the arm in the views."""
+    """Name or file of the arm in the views, as `load_robot` takes it."""
     families: Annotated[tuple[Annotated[str, OneOf(FAMILIES)], ...], Filled()] = tuple(FAMILIES)
     """Families of the scenes, with equal shares."""
     weights: str | None = None
@@ -138,10 +138,12 @@ def train_completion(settings: CompletionTraining, out: str) -> dict[str, float]
     The same call continues a run that was interrupted. Returns, on held-out scenes, the cross-entropy per
     voxel (`validation`) and the fitted temperature; precision, recall, average precision and expected
     calibration error of each family; the expected calibration error over all families of the training; and
-    `samples`. Raises the errors of `loop.train`.
+    the number of training samples (`samples`).
+
+    Raises the errors of `loop.train` and `Processes`, and InputError for an unusable robot and for weights
+    of a network with other settings.
     """
-    processes = Processes(settings.device)
-    task = CompletionTask(settings, processes)
+    task = CompletionTask(settings, Processes(settings.device))
     try:
         return train(task, out)
     finally:
@@ -223,8 +225,7 @@ class CompletionTask(TrainingTask):
         """`count` held-out samples of each family, beginning with sample number `first`."""
         parts = []
         for name in families:
-            index = list(FAMILIES).index(name)
-            rng = np.random.default_rng([HELD_OUT_SEED, index])
+            rng = np.random.default_rng([HELD_OUT_SEED, list(FAMILIES).index(name)])
             seeds = rng.integers(SEED_LIMIT, size=first + count)[first:]
             parts.append(draw_samples((name,), self.robot, seeds.tolist()))
         return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))

@@ -31,8 +31,8 @@ from robotdiffuse.learning.training.losses import LossSettings
 from robotdiffuse.learning.weight_files import NETWORKS
 
 STAGES = ((0.72, 9), (0.90, 4), (1.0, 1))
-"""Stages of progressive training (`PlannerTraining.progressive`). Each has the share of the training at
-which it ends, and a number of waypoints: in this stage, each token is the mean of a block of so many."""
+"""Stages of progressive training (`PlannerTraining.progressive`). Each has the share of the training at which
+it ends, and the number of waypoints in a block: in this stage, each token is the mean of a block."""
 
 
 def block_at(fraction: float) -> int:
@@ -45,7 +45,7 @@ ShareBelowOne = Annotated[float, Bound(least=0.0, below=1.0)]
 
 def one_length(given: dict[str, Any]) -> dict[str, Any]:
     """The given settings. If `minutes` is given, `samples` becomes None; if only `samples` is given,
-    `minutes` becomes None. Otherwise, the default of the other setting would hold."""
+    `minutes` becomes None. Without this, the default of the other setting would hold as well."""
     if given.get("minutes") is not None:
         return given | {"samples": None}
     return given if given.get("samples") is None else given | {"minutes": None}
@@ -142,9 +142,10 @@ class PlannerTraining(MotionTraining, ModelParts):
     """Training of the diffusion model."""
 
     encoder: str | None
-    """One of: a folder with a trained encoder, which stays frozen; `pointnet` or `dgcnn`, which are trained
-    jointly, by the planner's loss, on new clouds for every batch; `points`, an encoder without weights, for
-    the denoiser `cross_attention`; None for a prior, whose inputs do not include the scene."""
+    """One of: a folder with a trained encoder, which stays frozen; a name in ENCODERS, such as `pointnet`:
+    this encoder is trained jointly, by the planner's loss, on new clouds for every batch (`points` has no
+    weights, and needs the denoiser `cross_attention`); None for a prior, whose inputs do not include the
+    scene."""
     minutes: Positive | None = 70.0
     learning_rate: Positive = 6e-4
     """Peak learning rate of AdamW (paper: 3e-4)."""

@@ -7,9 +7,7 @@ import io
 import json
 import math
 import shutil
-import signal
 import sys
-import threading
 import time
 from abc import ABC, abstractmethod
 from collections import defaultdict
@@ -17,7 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import numpy as np
@@ -33,8 +31,8 @@ from torch.optim.swa_utils import AveragedModel
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, counted, needs, reading
-from robotdiffuse.core.interrupts import handled
-from robotdiffuse.core.output_files import lock_folder, write_atomically
+from robotdiffuse.core.files import JsonObject, lock_folder, write_atomically
+from robotdiffuse.core.interrupts import STOPS, handled
 from robotdiffuse.learning import need_packages
 from robotdiffuse.learning.checkpoint import save_network
 from robotdiffuse.learning.encoders.networks import Encoder
@@ -151,7 +149,7 @@ BAR_WIDTH = 24
 """Width of the progress bar [characters]. Bar and figures then fit into 80 columns; a line that wraps would
 be printed again at every update."""
 LOG_EVERY = 50
-"""log.csv gets a row every so many steps, and at each checkpoint."""
+"""Number of steps between two rows of log.csv. Each checkpoint adds a row too."""
 
 
 class Validation(NamedTuple):
@@ -190,11 +188,11 @@ class TrainingTask(ABC):
         loss, success = self.validate(1.0)
         return {"validation": loss} | ({} if success is None else {"success": success})
 
-    def about(self) -> dict[str, Any]:
+    def about(self) -> JsonObject:
         """Further information on the training for the description of the weights."""
         return {}
 
-    def save(self, folder: FilePath, training: dict[str, Any]) -> None:
+    def save(self, folder: Path, training: JsonObject) -> None:
         """Write the weights, in files named by the title, and their description."""
         save_network(self.title, self.module, folder, training)
 
@@ -228,7 +226,7 @@ class TrainingRun:
         self.module = task.module
         self.settings = settings = task.settings
         self.processes = processes = task.processes
-        self.out = FilePath(out)
+        self.out = Path(out)
         # safetensors and TensorBoard could not open files there
         if out.encode("utf-8", "replace").decode() != out:
             raise InputError(f"the name of the folder {out} is not UTF-8; name another folder")
@@ -261,7 +259,7 @@ class TrainingRun:
         return min(1.0, self.at.seconds / (60 * (self.settings.minutes or 1.0)))
 
     def loop(self) -> None:
-        """Train to the end. On Ctrl-C or SIGTERM, store a checkpoint and raise KeyboardInterrupt.
+        """Train to the end. After a signal of STOPS, store a checkpoint and raise KeyboardInterrupt.
 
         Raises InputError if another run uses the folder, or if the loss diverges.
         """
@@ -269,8 +267,8 @@ class TrainingRun:
         torch.set_num_threads(self.settings.threads)
         try:
             lock = lock_folder(self.out) if self.processes.first else nullcontext()
-            stop = threading.Event()  # set by SIGINT and SIGTERM, so that the current step is finished first
-            stopping = handled(lambda *_: stop.set(), signal.SIGINT, signal.SIGTERM)
+            stopped_by: list[int] = []  # only noted, so that the current step is finished first
+            stopping = handled(lambda number, _: stopped_by.append(number), *STOPS)
             with lock, stopping, _progress(self.processes.first) as progress:
                 bar = progress.add_task(self.task.title, total=1.0, rate="", loss="")
                 last = saved = time.monotonic()
@@ -279,8 +277,8 @@ class TrainingRun:
                     self.step()
                     now = time.monotonic()
                     due = now - saved > self.settings.checkpoint_seconds
-                    # means: above 0 in all processes if any one got a signal or is due
-                    elapsed, stopped, due = self.processes.mean(now - last, stop.is_set(), due)
+                    # the mean over the processes is above 0 if any one of them got a signal or is due
+                    elapsed, stopped, due = self.processes.mean(now - last, bool(stopped_by), due)
                     self.at.seconds += elapsed
                     rate = self._samples_per_step / max(elapsed, 1e-9)
                     last = now
@@ -294,7 +292,7 @@ class TrainingRun:
                 progress.update(bar, completed=self.fraction)
                 self._checkpoint(progress.console)
                 if stopped:
-                    raise KeyboardInterrupt
+                    raise KeyboardInterrupt(*stopped_by[:1])
         finally:
             torch.set_num_threads(threads)
 
@@ -356,6 +354,7 @@ class TrainingRun:
             p.copy_(value)
 
     def _log(self, validation: Validation | None) -> None:
+        # the mean since the last row; if every step was skipped, that of the last row
         loss = (
             float(np.mean(self._losses)) if self._losses else self.rows[-1]["loss"] if self.rows else math.nan
         )
@@ -412,6 +411,7 @@ class TrainingRun:
             "identity": self.identity,
             "at": asdict(self.at),
             "random": random_states,
+            "about": self.task.about(),
             "losses": self._losses,
             "rows": self.rows,
         }
@@ -433,18 +433,28 @@ class TrainingRun:
     def _plot(self) -> None:
         """Write the log for TensorBoard if that is installed (extra `train`)."""
         try:
-            from torch.utils.tensorboard import SummaryWriter
+            from tensorboard.compat.proto.event_pb2 import Event  # type: ignore[attr-defined]
+            from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[attr-defined]
+            from tensorboard.summary.writer.record_writer import RecordWriter
         except ImportError:
             return
+        now = time.time()
+        # in memory, since on a full disk a thread of PyTorch's SummaryWriter would print a traceback
+        content = io.BytesIO()
+        writer = RecordWriter(content)
+        writer.write(Event(wall_time=now, file_version="brain.Event:2").SerializeToString())
+        for row in self.rows:
+            for name in ("learning_rate", "loss", "validation", "success"):
+                if row[name] != "":
+                    summary = Summary(value=[Summary.Value(tag=name, simple_value=float(row[name]))])
+                    event = Event(wall_time=now, step=int(row["samples"]), summary=summary)
+                    writer.write(event.SerializeToString())
         folder = self.out / "tensorboard"
         # all rows are written again, so that a resumed run leaves no second curve
         shutil.rmtree(folder, ignore_errors=True)
         # errors in writing the plots, as on a full disk, must not end the run
-        with suppress(OSError), SummaryWriter(str(folder)) as writer:
-            for row in self.rows:
-                for name in ("learning_rate", "loss", "validation", "success"):
-                    if row[name] != "":
-                        writer.add_scalar(name, float(row[name]), int(row["samples"]))
+        with suppress(InputError):
+            write_atomically(folder / f"events.out.tfevents.{now:.0f}", content.getvalue(), make_folder=True)
 
     def _restore(self) -> None:
         states = defaultdict[str, dict[str, Tensor]](dict)
@@ -455,6 +465,9 @@ class TrainingRun:
                     part, _, name = key.partition(".")
                     states[part][name] = stored.get_tensor(key)
             self._check_same(notes["settings"] | notes["identity"])
+            about = self.task.about()
+            if self.processes.first and notes.get("about", about) != about:
+                print(f"{self._file} was trained on other data; the training goes on", file=sys.stderr)
             self.module.load_state_dict(states.pop("module"))
             self.average.load_state_dict(states.pop("average"))
             moments = {int(index): state for index, state in states.items()}
@@ -464,7 +477,7 @@ class TrainingRun:
             self._losses = notes["losses"]
             self.rows = notes["rows"]
 
-    def _check_same(self, before: dict[str, Any]) -> None:
+    def _check_same(self, before: JsonObject) -> None:
         default = {"processes": "1"}
         now = default | json.loads(json.dumps(self.settings.to_json())) | self.identity
         before = default | before
@@ -506,7 +519,7 @@ def train(task: TrainingTask, out: str) -> dict[str, float]:
         about = {"settings": task.settings.to_json(), **task.about(), "minutes": minutes, **report}
         today = f"{datetime.now(UTC):%Y-%m-%d}"
         versions = {"robotdiffuse": __version__, "torch": torch.__version__}
-        task.save(FilePath(out), about | versions | {"made": today})
+        task.save(Path(out), about | versions | {"made": today})
     return task.processes.share(report)
 
 
@@ -563,5 +576,5 @@ class MotionTask(TrainingTask):
             ]
             return Validation(float(np.mean(losses)), self.success(rng))
 
-    def about(self) -> dict[str, Any]:
+    def about(self) -> JsonObject:
         return {"data": self.data.digest, "trajectories": len(self.data)}

@@ -28,8 +28,9 @@ class ForwardKinematics:
     Configurations `q` [rad], or [m] for prismatic joints, have any batch shape. They are converted to `dtype`
     and moved to `device`; so the results are of this type and on this device.
 
-    The frame of joint j is T[j + 1] = T[parents[j]] @ (C + cos(q) A + sin(q) B) with constant A, B and C.
-    Each frame takes one small matrix product and two multiply-adds over the batch.
+    The frame of joint j is T[j + 1] = T[parents[j]] @ (C + cos(q) A + sin(q) B) with constant A, B and C; for
+    a prismatic joint it is T[parents[j]] @ (C + q S) with constant C and S (the slide).
+    Each frame takes one small matrix product and one or two multiply-adds over the batch.
     """
 
     def __init__(
@@ -38,7 +39,7 @@ class ForwardKinematics:
         self.robot = robot
         self.dtype = dtype
         self.device = torch.device(device)
-        # C, A and B of a rotation about z; C and the slide of a translation along z
+        # C, A and B of a rotation about z; for a translation along z, C and the slide S, which q multiplies
         turns = np.zeros((3, 4, 4))
         turns[0, 2, 2] = turns[0, 3, 3] = 1
         turns[1, 0, 0] = turns[1, 1, 1] = 1
@@ -47,7 +48,7 @@ class ForwardKinematics:
         slides = np.stack([np.eye(4), np.outer([0, 0, 1, 0], [0, 0, 0, 1])])
         self._steps = []
         """For each joint, stacked transposed matrices: [12, 4] C, A and B; for a prismatic joint [8, 4] C and
-        the slide."""
+        S."""
         for offset, prismatic in zip(robot.frame_offsets, robot.prismatic, strict=True):
             self._steps.append(self.tensor(np.hstack(list(offset @ (slides if prismatic else turns))).T))
         self._last_row = self.tensor(np.array([[0.0], [0.0], [0.0], [1.0]]))
@@ -82,7 +83,7 @@ class ForwardKinematics:
 POINT_UNIT = 0.1
 """Distances in L_point and L_collision are divided by this [m], to be about as large as L_joint."""
 MAX_DISTANCE = 1.0
-"""Larger distances of points from obstacles count as this [m]; so does the distance from an empty scene."""
+"""Larger distances of sphere centers from obstacles count as this [m]; so do distances in an empty scene."""
 SAFE_DISTANCE = 0.05
 """S of the hinge h in L_collision [m]: distances below it are penalized."""
 EPSILON = 1e-12

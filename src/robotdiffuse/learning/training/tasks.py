@@ -178,9 +178,8 @@ MAX_STATISTICS_TRAJECTORIES = 20_000
 
 
 def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
-    """Train the diffusion model. Write model.safetensors, from which training continues, the ONNX files that
-    planning runs, and model.json. For a prior (a model without the scene as input) the files are named
-    trajectory_prior.
+    """Train the diffusion model. Write model.safetensors, the ONNX files that planning runs, and model.json.
+    For a prior (a model without the scene as input) the files are named trajectory_prior.
 
     The same call continues a run that was interrupted. Returns `validation`, the loss on held-out
     trajectories; `success`, the share of collision-free motions among samples for held-out problems; and
