@@ -13,9 +13,9 @@ from .core.types import load_result as load_result
 from .datasets.external import write_dataset as write_dataset
 from .datasets.loader import RopDataset as RopDataset
 from .interop.depth_recording import read_depth_views as read_depth_views
-from .perception.camera_calibration import calibrate_camera as calibrate_camera
 from .perception.depth_filter import measure_noise as measure_noise
 from .perception.depth_view import DepthView as DepthView
+from .perception.pose_refinement import calibrate_camera as calibrate_camera
 from .planning import load_planner as load_planner
 from .planning import plan as plan
 from .planning.exploration.explorer import Explorer as Explorer
@@ -47,7 +47,7 @@ from .problems.problem import Problem as Problem
 from .robots import load_robot as load_robot
 from .robots.bodies import Payload as Payload
 from .robots.robot import Robot as Robot
-from .scenes.moving_obstacles import MovingObstacle as MovingObstacle
+from .scenes.scene import MovingObstacle as MovingObstacle
 from .scenes.scene import Scene as Scene
 from .scenes.shapes import Box as Box
 from .scenes.shapes import Capsule as Capsule

@@ -15,8 +15,7 @@ from robotdiffuse.core.types import Points, Pose
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual_meshes import load_visual
-from robotdiffuse.scenes.moving_obstacles import MovingObstacle
-from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene import MovingObstacle, Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
 Color = tuple[int, int, int]
@@ -81,9 +80,7 @@ def painted(color: Color, count: int) -> Points:
     return np.tile(np.array(color) / 255.0, (count, 1))
 
 
-def creased(
-    vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"], colors: Float[ndarray, "f 3"]
-) -> Surface:
+def creased(vertices: Points, faces: Int[ndarray, "f 3"], colors: Float[ndarray, "f 3"]) -> Surface:
     """A surface that is shaded smoothly except across sharp edges (CREASE_ANGLE), where vertices are
     duplicated so that each side has a normal of its own. colors: a color per face, 0 to 1."""
     triangles = vertices[faces]
@@ -235,9 +232,7 @@ def thinned(points: Points) -> Points:
     return points[:: -(-len(points) // MAX_SIZE)] if len(points) else points
 
 
-def decimated(
-    vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"]
-) -> tuple[Float[ndarray, "w 3"], Int[ndarray, "g 3"]]:
+def decimated(vertices: Points, faces: Int[ndarray, "f 3"]) -> tuple[Points, Int[ndarray, "g 3"]]:
     """The mesh with at most MAX_SIZE faces: the vertices in each cell of a grid are merged, and the cells
     grow until few enough faces are left."""
     cell = float(np.ptp(vertices, axis=0).max()) / 400

@@ -258,7 +258,7 @@ def test_where_no_motion_turns_evenly_one_that_turns_otherwise_has_a_note() -> N
     q = np.array([*arm, 0.0237, 0.0236])
     pose = [0.7810504, -0.0747778, 0.325, 0.0, 0.9510565, 0.0, 0.309017]
     result = made.plan_screw(pose, q, planning_time=0.5)
-    assert result["status"] == "Success" and "this one turns otherwise" in result["note"]
+    assert result["status"] == "Success" and "this motion turns unevenly" in result["note"]
     line = [made.workspace.pose(q)[:3, 3] for q in result["position"]]
     assert np.allclose(line, pose[:3], atol=8e-3) and np.allclose(line[-1], pose[:3], atol=1e-3)
 
@@ -275,3 +275,19 @@ def test_a_line_to_the_edge_of_reach_ends_tilted_with_a_note(made: Planner) -> N
     assert 0.01 < np.arccos(end[2, 2] * far[2, 2]) < np.radians(15)
     far[0, 3] = 1.2
     assert re.search("out of reach|brings", made.plan_screw(far, q)["status"])
+
+
+def test_limits_that_are_set_while_an_object_is_held_remain(made: Planner) -> None:
+    made.update_attached_box([0.03, 0.03, 0.03], [0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0])
+    made.joint_vel_limits = np.full(7, 0.1)
+    made.detach_object()
+    assert np.array_equal(made.joint_vel_limits, np.full(7, 0.1))
+
+
+def test_self_collisions_are_checked_with_the_other_arm_where_qpos_has_it() -> None:
+    left = rd.load_robot("baxter_left")
+    other = [f"right_{joint}" for joint in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")]
+    made = Planner("baxter_left", left.tip, user_joint_names=[*left.joint_names, *other])
+    arm = [-0.8, 0.5, -2.0, 1.5, 2.8, 1.1, 2.9]
+    assert not made.check_for_self_collision([*arm, *np.zeros(7)])
+    assert made.check_for_self_collision([*arm, 0.3, 1.0, 2.1, 2.0, 2.4, 0.7, -0.9])

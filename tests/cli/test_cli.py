@@ -166,7 +166,7 @@ def test_a_module_of_the_current_folder_adds_planners_and_shapes(tmp_path: Path,
         again = ("verify", "a.csv", "--problem", problem)
         for command in (("verify", "result.json"), ("export", "result.json", "--out", "a.csv"), again):
             assert run(*command, "--import", "added") == 0
-    error = said(2, "planner", "list", "--import", "no_such_module")
+    error = said(2, "bench", "confirm", "runs", "--import", "no_such_module")
     assert "module 'no_such_module' cannot be imported: ModuleNotFoundError" in error
 
 
@@ -273,7 +273,7 @@ def test_robot_add_with_srdf_and_robot_list(tmp_path: Path, capsys, said: Said, 
         assert run("robot", "add", str(file), "--allow", "j1_link", "j4_link") == 0
     told = capsys.readouterr()
     assert "pairs that differ from made.srdf" in told.out and "User" in told.out and "named 1" in told.out
-    assert "5 of 11: spheres of base" in told.err and "11 of 11: done" in told.err
+    assert "5 of 12: spheres of base" in told.err and "12 of 12: done" in told.err
     allowed = load_robot("made").allowed_collisions
     assert frozenset(("j1_link", "j4_link")) in allowed
     assert frozenset(("base", "j4_link")) not in allowed  # found beside: compared, not taken

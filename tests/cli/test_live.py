@@ -61,8 +61,8 @@ def test_elsewhere_no_browser_gets_data_without_the_token() -> None:
         assert not hears(url, token[:-1])
         assert not hears(url, token, Origin="http://evil.example")
     finally:
-        server.send_signal(signal.SIGINT)
-        assert server.wait(timeout=300) == 130
+        server.send_signal(signal.SIGTERM)
+        assert server.wait(timeout=300) == 143
 
 
 def test_on_this_machine_pages_of_other_origins_get_no_data() -> None:

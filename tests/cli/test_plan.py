@@ -15,8 +15,8 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.commands import GOAL, PROBLEM, START, Said, run, write_problem
-from robotdiffuse.cli.demo import shelf_problem
-from robotdiffuse.core.interrupts import handled
+from helpers.full_disk import full_disk
+from robotdiffuse.cli.explore import shelf_problem
 from robotdiffuse.planning import load_planner, planner_settings
 from robotdiffuse.problems.files import load_problem, problem_record
 from robotdiffuse.visualization.picture import PictureSettings
@@ -49,6 +49,13 @@ def test_files_are_written_though_nobody_reads_what_is_printed(tmp_path: Path, m
         patch.setattr("sys.stdout", nobody)
         run("plan", problem, "--planner", "rrt_connect", "--time-limit", 5, "--out", "r.json")
     assert rd.load_result("r.json").result.solved
+
+
+def test_the_result_is_printed_though_its_file_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    problem = write_problem(tmp_path)
+    with full_disk():
+        assert run("plan", problem, "--planner", "rrt_connect", "--time-limit", 5, "--out", "r.json") == 3
+    assert "solved" in capsys.readouterr().out
 
 
 def melon(y: float) -> dict[str, Any]:
@@ -102,19 +109,18 @@ def test_problem_of_a_jsonl_file(tmp_path: Path, said: Said) -> None:
     assert "invalid_start" in said(1, "plan", file, "--planner", "rrt_connect", "--index", 1)
 
 
-def test_ctrl_c(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, said: Said) -> None:
+def test_ctrl_c_and_sigterm(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, said: Said) -> None:
     """Regressions: Ctrl-C is the cause of a SystemError in compiled code that makes tuples; a callback loses it."""
 
     def lost(*_: object, **__: object) -> None:
-        ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()
+        ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGTERM))()
         time.sleep(60.0)
 
     from_compiled_code = SystemError("returned a result with an exception set")
     from_compiled_code.__cause__ = KeyboardInterrupt()
-    for error in (KeyboardInterrupt, from_compiled_code, lost):
+    for error, status in ((KeyboardInterrupt, 130), (from_compiled_code, 130), (lost, 143)):
         monkeypatch.setattr("robotdiffuse.cli.plan.load_and_plan", Mock(side_effect=error))
-        with handled(signal.default_int_handler, signal.SIGINT):
-            assert said(130, "plan", write_problem(tmp_path), "--planner", "rrt_connect") == "robotdiffuse: stopped\n"
+        assert said(status, "plan", write_problem(tmp_path), "--planner", "rrt_connect") == "robotdiffuse: stopped\n"
 
 
 def test_plan_takes_settings_of_the_planner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -144,12 +150,14 @@ def test_the_clearance_is_printed_beside_the_requested_one(tmp_path: Path, said:
     assert "clearance is 5.0; it must be between 0 and 0.5" in said(2, "plan", far, "--clearance", 5)
 
 
-def test_files_of_the_wrong_kind_name_the_right_command(tmp_path: Path, said: Said) -> None:
+def test_wrong_files_are_answered_with_what_is_right(tmp_path: Path, said: Said) -> None:
     problem = write_problem(tmp_path)
     rd.PlanResult(rd.Status.NO_PATH, "none", "aorrtc", "panda", 0.1, 0).save("result.json")
     assert "it is a result, not a problem; `robotdiffuse view` draws it" in said(2, "plan", "result.json")
     for file in (problem, tmp_path / "problem.yaml"):
         assert "it is a problem; `robotdiffuse plan" in said(2, "export", file, "--out", "r.csv")
+    assert ". is a folder" in said(2, "plan", ".")
+    assert "(angles are in radians)" in said(2, "plan", write_problem(tmp_path, start=[0, -45, 0, -135, 0, 90, 45]))
 
 
 def test_the_demo_of_another_arm_is_not_solved_by_the_straight_line() -> None:
@@ -165,11 +173,6 @@ def test_plan_ignores_joints_where_it_is_told_to(tmp_path: Path, said: Said) -> 
     asked = ("plan", write_problem(tmp_path, scene="stranger.yaml"), "--planner", "rrt_connect")
     assert "has values of gripper, movable joints that panda lacks" in said(2, *asked)
     assert "ignored gripper" in said(0, *asked, "--ignore-joints")
-
-
-def test_a_folder_and_degrees_are_named(tmp_path: Path, said: Said) -> None:
-    assert ". is a folder" in said(2, "plan", ".")
-    assert "(angles are in radians)" in said(2, "plan", write_problem(tmp_path, start=[0, -45, 0, -135, 0, 90, 45]))
 
 
 def test_plan_and_verify_name_allowed_contacts(tmp_path: Path, said: Said) -> None:

@@ -83,3 +83,9 @@ def test_only_valid_motions_are_exported(planned: Path, said: Said) -> None:
     assert Path("fine.csv").read_text().splitlines()[2].startswith("0.001,")
     assert run("export", planned / "r.json", "--out", "fine.csv", "--rate", "-1") == 2
     assert "known: .json, .csv, .mcap, .rosbag2, .rrd, .yaml" in said(2, "export", planned / "r.json", "--out", "a.foo")
+
+
+def test_options_that_would_be_ignored_are_refused(planned: Path, said: Said) -> None:
+    assert "--index says which" in said(2, "verify", planned / "r.json", "--index", 3)
+    assert "--topic is for bags" in said(2, "verify", planned / "r.json", "--topic", "/x")
+    assert "--shell is for pictures" in said(2, "view", planned / "r.json", "--shell", 0.05, "--out", "a.png")

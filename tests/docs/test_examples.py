@@ -41,15 +41,12 @@ def test_example_runs(example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert (tmp_path / f"{example.stem}.png").stat().st_size > 1000
 
 
-def test_the_gallery_has_thirteen_short_examples_with_pictures() -> None:
+def test_the_gallery_has_thirteen_examples_and_the_first_motion_keeps_its_clearance() -> None:
     numbered = [file for file in EXAMPLES if file.stem[0].isdigit()]
     assert len(numbered) == 13
     for file in numbered:
         assert len(file.read_text(encoding="utf-8").splitlines()) < 40, file.name
         assert (ROOT / "docs" / "images" / "gallery" / f"{file.stem}.png").is_file(), file.name
-
-
-def test_the_first_motion_of_the_readme_keeps_the_asked_clearance() -> None:
     assert "plan examples/ball.yaml --until first" in (ROOT / "README.md").read_text()
     assert rd.plan(rd.Problem.load(ROOT / "examples" / "ball.yaml"), until="first").scene_clearance >= 0.01
 

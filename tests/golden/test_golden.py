@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from robotdiffuse.problems.families import FAMILIES
-from robotdiffuse.problems.files import problem_record
-from robotdiffuse.problems.held_out import held_out_problem
+from robotdiffuse.problems.files import held_out_problem, problem_record
 
 GOLDEN = Path(__file__).with_name("golden.json")
 

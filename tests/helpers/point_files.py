@@ -7,18 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray
 
-PCD = """# .PCD v0.7
-VERSION 0.7
-FIELDS rgb x y z _
-SIZE 4 4 4 4 1
-TYPE U F F F U
-COUNT 1 1 1 1 4
-WIDTH {n}
-HEIGHT 1
-VIEWPOINT 0 0 0 1 0 0 0
-POINTS {n}
-DATA {data}
-"""
+PCD = (Path(__file__).parents[1] / "files" / "header.pcd").read_text()
 PCD_FORMS = ["pcd ascii", "pcd binary", "pcd binary_compressed"]
 FORMS = ["npy", "npz", "ply ascii", "ply binary", *PCD_FORMS, "csv", "csv with names", "xyz"]
 
@@ -44,8 +33,7 @@ def pcd(points: ndarray, storage: str) -> bytes:
     record["xyz"] = points
     if storage == "binary":
         return header + record.tobytes()
-    columns = [record["rgb"], *record["xyz"].T, record["_"]]
-    content = b"".join(np.ascontiguousarray(column).tobytes() for column in columns)
+    content = b"".join(np.ascontiguousarray(column).tobytes() for column in [record["rgb"], *record["xyz"].T, record["_"]])
     packed = lzf_packed(content)
     return header + struct.pack("<II", len(packed), len(content)) + packed
 

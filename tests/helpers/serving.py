@@ -46,13 +46,13 @@ if __name__ == "__main__":
     from helpers.planners import ENTRY
     from robotdiffuse.cli import main
     from robotdiffuse.planning import PLANNERS
-    from robotdiffuse.server import connection, server
+    from robotdiffuse.server import app, connection
 
     def end_with_parent() -> None:
         os.read(0, 1)
         os._exit(0)
 
     PLANNERS["faulty"] = ENTRY
-    connection.READ_TIMEOUT = server.KEEP_ALIVE_TIMEOUT = float(os.environ.get("CLIENT_TIMEOUT", "3.0"))
+    connection.READ_TIMEOUT = app.KEEP_ALIVE_TIMEOUT = float(os.environ.get("CLIENT_TIMEOUT", "3.0"))
     threading.Thread(target=end_with_parent, daemon=True).start()
     sys.exit(main())

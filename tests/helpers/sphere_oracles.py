@@ -107,8 +107,7 @@ def rows(robot: Robot, count: int, seed: int = 0) -> ndarray:
 def solids() -> Scene:
     box = Box((0.0, 0.6, 0.4), (0.2, 0.3, 0.2), (0.9, 0.1, 0.3, 0.1))
     cylinder = Cylinder((0.4, -0.4, 0.3), 0.08, 0.5, (0.9, 0.3, 0.0, 0.1))
-    capsule = Capsule((-0.4, -0.3, 0.5), 0.06, 0.5, (0.9, 0.3, 0.5, 0.1))
-    return Scene([Sphere((0.5, 0.3, 0.6), 0.2), box, cylinder, capsule])
+    return Scene([Sphere((0.5, 0.3, 0.6), 0.2), box, cylinder, Capsule((-0.4, -0.3, 0.5), 0.06, 0.5, (0.9, 0.3, 0.5, 0.1))])
 
 
 def random_shape(kind: str, rng: np.random.Generator) -> Shape:

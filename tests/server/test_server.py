@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import AsyncMock
 
 import httpx
 import numpy as np
@@ -235,7 +236,7 @@ def test_a_request_beyond_its_time_limit_is_stopped(server: httpx.Client) -> Non
         until(lambda: gauge(server, "workers_busy") == 1 or late.done())
         assert server.get("/health", timeout=PROMPT).status_code == 200
     assert late.result().status_code == 503
-    assert "stopped 5 s beyond its time limit, and its worker replaced" in error(late.result())
+    assert "took too long: it was stopped, and its worker replaced" in error(late.result())
 
 
 def test_large_requests_take_little_time(server: httpx.Client) -> None:
@@ -377,3 +378,13 @@ def test_robots_named_at_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     for name in ("panda", str(tmp_path / "mine")):  # the robot in the folder is also called panda
         refuses("has the name panda of another robot", served_robots, [name])
     refuses("unknown robot 'yours'", served_robots, ["yours"])
+
+
+def test_a_token_with_letters_beyond_ascii_is_known_as_utf_8_too() -> None:
+    application = AsyncMock()
+    access = Access(application, ServeSettings(token="pässwort"))
+    for raw in ("Bearer pässwort".encode(), "Bearer pässwort".encode("latin-1")):
+        scope = {"type": "http", "method": "GET", "path": "/robots", "raw_path": b"/robots", "client": None}
+        headers = [(b"host", b"localhost"), (b"authorization", raw)]
+        asyncio.run(access(scope | {"headers": headers}, AsyncMock(), AsyncMock()))
+    assert application.await_count == 2

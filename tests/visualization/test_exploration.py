@@ -27,8 +27,7 @@ def test_a_cube_has_six_faces_around_it() -> None:
     outside[0, 2, 3] = True
     assert exploration.faces_between(inside, outside)[0].tolist() == [at - 30], "between the two sets alone"
     surface = exploration.faces_surface(inside, ~inside, (255, 0, 0))
-    center = (np.array([1.5, 2.5, 3.5])) * MAP.edge + MAP.low
-    away = surface.vertices - center
+    away = surface.vertices - np.array([1.5, 2.5, 3.5]) * MAP.edge - MAP.low
     np.testing.assert_allclose(np.abs(away), MAP.edge / 2)
     np.testing.assert_allclose((away * surface.normals).sum(axis=1), MAP.edge / 2)
     assert len(surface.faces) == 12 and (surface.colors == [1, 0, 0]).all()
@@ -108,8 +107,7 @@ def test_a_browser_shows_the_steps(page: Path) -> None:
         shown.on("pageerror", lambda error: errors.append(str(error)))
         shown.goto(f"{page.as_uri()}#at=1")
         rows = shown.evaluate("[...document.querySelectorAll('#steps li')].map((row) => row.ariaCurrent)")
-        names = "[...document.querySelectorAll('#toggles button')].map((b) => b.textContent)"
-        toggles = shown.evaluate(names)
+        toggles = shown.evaluate("[...document.querySelectorAll('#toggles button')].map((b) => b.textContent)")
         pixels = shown.evaluate("layers.map((layer) => layer.meshes[0].geometry.index.count)")
     assert not errors and rows == ["false"] * (len(explorer.steps) - 1) + ["true"]
     assert toggles[:5] == ["Occupied", "Predicted", "Unknown", "Next view", "True scene"]

@@ -14,8 +14,7 @@ from robotdiffuse import Box, Path, Scene, load_robot
 from robotdiffuse.drawables import creased, drawables
 from robotdiffuse.robots.visual_meshes import has_visual, load_visual
 from robotdiffuse.visualization import PictureSettings, write_comparison, write_picture
-from robotdiffuse.visualization.arm import DrawnArm
-from robotdiffuse.visualization.picture import COMPARED, MARGINS, drawn_by, render, view_of_motion
+from robotdiffuse.visualization.picture import COMPARED, MARGINS, DrawnArm, drawn_by, render, view_of_motion
 
 SMALL = PictureSettings(width=320, height=200, ghosts=2)
 

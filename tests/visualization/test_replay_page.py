@@ -14,7 +14,7 @@ from helpers.refusals import refuses
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.drawables import decimated
 from robotdiffuse.visualization import PictureSettings, write_picture, write_replay
-from robotdiffuse.visualization.arm import DrawnArm
+from robotdiffuse.visualization.picture import DrawnArm
 from robotdiffuse.visualization.replay_page import COLLIDING, write_problem
 
 pytestmark = pytest.mark.usefixtures("few_lights")
@@ -135,3 +135,12 @@ def test_a_goal_out_of_reach_has_axes(moved: bool, tmp_path: Path) -> None:
 def test_of_several_goals_a_free_one_is_drawn(tmp_path: Path) -> None:
     problem = rd.Problem(PANDA, rd.Scene([AT_START]), GOAL, [START, GOAL])
     assert page(problem, tmp_path / "a.html")["positions"][1] == GOAL.tolist()
+
+
+def test_a_motion_of_other_joints_is_not_drawn(tmp_path: Path) -> None:
+    for motion in (
+        rd.Path(PANDA.joint_names[::-1], np.stack([START, GOAL])),
+        rd.Path(PANDA.joint_names, np.full((2, 7), np.nan)),
+    ):
+        for write, name in ((write_picture, "a.png"), (write_replay, "a.html")):
+            refuses("^the motion (moves|has)", write, PANDA, rd.Scene(), motion, tmp_path / name)

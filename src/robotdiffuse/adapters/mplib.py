@@ -8,7 +8,7 @@ matrix. If a plan fails, `status` contains the reason too.
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache, partial, reduce
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -29,8 +29,8 @@ from robotdiffuse.core.errors import (
     rigid_transform,
     shown,
 )
-from robotdiffuse.core.input_files import file_name, read_bytes
-from robotdiffuse.core.transforms import inverse, pose, transform
+from robotdiffuse.core.files import file_name, read_bytes
+from robotdiffuse.core.transforms import pose, transform
 from robotdiffuse.core.types import PlanResult
 from robotdiffuse.planning.workspace import Workspace
 from robotdiffuse.problems.compiled_constraints import rotation_vector
@@ -41,6 +41,7 @@ from robotdiffuse.robots.fitting.preparation import add_robot
 from robotdiffuse.robots.parsing.urdf import UrdfTree, with_limits
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import ROBOT_FILE, user_robots
+from robotdiffuse.scenes.scene import without_link
 from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Sphere
 from robotdiffuse.validation.tolerances import DEFAULT
 
@@ -76,14 +77,16 @@ OPTIONS = (
     "use_attach",
     "verbose",
 )
-"""Options of MPlib's plans; the first three have an effect. Others, such as constraints, are refused."""
+"""Options of MPlib's plans: the first three have an effect, the rest are ignored. Options that are not listed
+here, such as constraints, are refused."""
 
 
 class Planner:
     """Plans motions of a robot, as `mplib.Planner` does.
 
     Args:
-        urdf: The robot's URDF, prepared on first use, in about a minute; or the name of a bundled robot.
+        urdf: The robot's URDF, prepared on first use, in about a minute; or the name of a bundled robot, for
+            which `srdf` and `package_keyword_replacement` are ignored.
         move_group: The link that goal poses refer to.
         srdf: SRDF with pairs of links that need no check; "" or none: these pairs are found by sampling.
         package_keyword_replacement: The folder that replaces `package://` in the URDF.
@@ -99,9 +102,10 @@ class Planner:
         verbose: Ignored.
 
     Raises:
-        InputError: For files that cannot be read, unknown links and joints, `user_joint_names` that lacks a
-            planned joint, repeats or reorders them, limits that are not a positive number for each planned
-            joint, and `objects` that are not empty.
+        InputError: For files that cannot be read, a package folder that does not exist, an unknown
+            `move_group`, unknown joints, `user_joint_names` that lacks a planned joint, repeats or reorders
+            them, limits that are not a positive number for each planned joint, and `objects` that are not
+            empty. Names in `user_link_names` are checked when an object is held.
     """
 
     def __init__(
@@ -135,8 +139,7 @@ class Planner:
                 f"{move_group} once, in the order {', '.join(robot.joint_names)}"
             )
         self._links = {-1: move_group, **dict(enumerate(user_link_names))}
-        limited = _limited(robot, joint_vel_limits, joint_acc_limits)
-        self.workspace = Workspace(limited, move_group)
+        self.workspace = Workspace(_limited(robot, joint_vel_limits, joint_acc_limits), move_group)
         """The robot and its obstacles. Add obstacles other than point clouds with `planner.workspace.add`."""
 
     @property
@@ -168,9 +171,7 @@ class Planner:
         Args:
             pose: T_world_base.
         """
-        before = self.workspace
-        self.workspace = Workspace(before.robot, before.tip, matrix(pose))
-        self.workspace.scene = before.scene.moved(inverse(self.workspace.T_world_base) @ before.T_world_base)
+        self.workspace.T_world_base = matrix(pose)
 
     def update_point_cloud(
         self,
@@ -206,7 +207,7 @@ class Planner:
             size: Edge lengths of the box [m].
             pose: Pose of the box in the frame of the link.
             link: `link_id` (MPlib 0.1), or `art_name` and `link_id` (0.2): the place of the link in
-                `user_link_names`; -1 or none: the move group. `art_name` is ignored.
+                `user_link_names`; -1 or omitted: the move group. `art_name` is ignored.
             named: The same by name.
         """
         self._hold(Box(np.zeros(3), size, name=HELD).moved(matrix(pose)), *link, **named)
@@ -225,6 +226,7 @@ class Planner:
         present = self._holds(name)
         if present:
             self.workspace.robot = self.robot.detach(name)
+            self.workspace.scene = without_link(self.workspace.scene, name)
         return present
 
     def _holds(self, name: str) -> bool:
@@ -266,7 +268,8 @@ class Planner:
 
         Args:
             goal_pose: The pose, in the frame of the world, or of the base if `wrt_world` is False.
-            current_qpos: The present joint values, in the order of `user_joint_names`.
+            current_qpos: The present joint values, in the order of `user_joint_names`; or only those of the
+                planned joints.
             mask: True for joints that are held; these must not be planned joints.
             options: `time_step` [s] between rows (0.1), `planning_time` [s] (1), `wrt_world`; other options
                 of MPlib are ignored, and constraints are refused.
@@ -301,8 +304,8 @@ class Planner:
         `target_pose` and `qpos` are MPlib 0.1's names of the first two arguments; `qpos_step` is ignored.
 
         If there is no such motion, a motion along the line that turns unevenly is tried. If the pose is out
-        of reach, but the arm can reach its position when tilted by at most 15 degrees, the motion ends
-        there, tilted. In both cases `note` says so.
+        of reach, but the arm can reach its position when tilted by at most 12 degrees, the motion ends
+        there, tilted by TILT_MARGIN times as much. In both cases `note` says so.
         """
         T = self._in_world(options.pop("target_pose", goal_pose), options)
         qpos = options.pop("qpos", current_qpos)
@@ -318,7 +321,7 @@ class Planner:
 
             if len(self.workspace.ik(T, near=start, count=1)):
                 uneven = self.workspace.plan_line(T, start, LOOSE_TOLERANCE, None, **request)
-                return noted(uneven, "no motion turns evenly along the line; this one turns otherwise")
+                return noted(uneven, "this motion turns unevenly; none along the line turns evenly")
             tilt = self._tilt(T, start)
             angle = np.linalg.norm(tilt)
             if angle > DEFAULT.goal_angle:
@@ -335,9 +338,10 @@ class Planner:
 
     def check_for_self_collision(self, *state: Any, **options: Any) -> list[str]:
         """A list with the reason why a configuration is refused even if all obstacles are ignored; empty if
-        it is free. The configuration is the last argument (MPlib 0.1: after the robot), `qpos` or `state`."""
-        start = self._state(state, options)
-        return _reasons(Workspace(self.robot), start)
+        it is free. The configuration is the first argument (MPlib 0.1: the second, after the robot), `qpos`
+        or `state`."""
+        q = self._state(state, options)  # locks joints of the robot, such as fingers
+        return _reasons(Workspace(self.robot), q)
 
     def check_for_env_collision(self, *state: Any, **options: Any) -> list[str]:
         """A list with the reason why a configuration is refused among the obstacles; empty if it is free. See
@@ -359,8 +363,8 @@ class Planner:
             if value is not None and np.size(value):  # MPlib 0.1: fixed_joint_indices=[]
                 check_name("option", name, OPTIONS)
         start = self._start(qpos)
-        step = options.get("time_step", 0.1)
-        if positive("options", "time_step", step) < MIN_TIME_STEP:
+        step = positive("options", "time_step", options.get("time_step", 0.1))
+        if step < MIN_TIME_STEP:
             raise InputError(f"time_step is {step}; it must be at least {MIN_TIME_STEP} s")
         time_limit = positive("options", "planning_time", options.get("planning_time", 1.0))
         try:
@@ -392,9 +396,8 @@ class Planner:
             return np.append(T[:3, 3] - T_world_tip[:3, 3], TILT_WEIGHT * turn)
 
         robot = self.robot
-        solution = least_squares(
-            errors, np.clip(start, robot.lower, robot.upper), bounds=(robot.lower, robot.upper)
-        )
+        upper = np.maximum(robot.upper, robot.lower + 1e-6)  # SciPy refuses equal limits
+        solution = least_squares(errors, np.clip(start, robot.lower, upper), bounds=(robot.lower, upper))
         in_reach = np.linalg.norm(solution.fun[:3]) < 1e-3
         return TILT_MARGIN * solution.fun[3:] / TILT_WEIGHT if in_reach else np.full(3, np.inf)
 
@@ -426,7 +429,7 @@ class Planner:
 
     def _qpos(self, q: ndarray, start_qpos: ArrayLike) -> ndarray:
         """`q` as a `qpos`; other joints as in `start_qpos`."""
-        qpos = np.ravel(np.array(start_qpos, float))
+        qpos = np.ravel(_array(start_qpos))
         if len(qpos) == len(q):
             return q
         qpos[self._places] = q
@@ -435,8 +438,9 @@ class Planner:
     def _check_mask(self, mask: Any) -> None:
         flags = np.ravel(() if mask is None else mask)
         masked_joints = [name for name, flag in zip(self.joint_names, flags, strict=False) if flag]
-        if not {*masked_joints}.isdisjoint(self.robot.joint_names):
-            raise InputError(f"mask holds {', '.join(masked_joints)}; planned joints cannot be held")
+        planned = [name for name in masked_joints if name in self.robot.joint_names]
+        if planned:
+            raise InputError(f"mask holds {', '.join(planned)}; planned joints cannot be held")
 
     def _hold(self, shape: RigidShape, art_name: Any = None, link_id: Any = -1) -> None:
         # the third argument of MPlib 0.1 is link_id
@@ -454,7 +458,7 @@ def _reasons(workspace: Workspace, q: ndarray) -> list[str]:
 def matrix(value: Any) -> ndarray:
     """The homogeneous transform of a pose: an object with `p` and `q`, seven numbers, or 4 x 4 numbers."""
     if hasattr(value, "p") and hasattr(value, "q"):
-        value = [*np.ravel(value.p), *np.ravel(value.q)]
+        value = np.append(_array(value.p), _array(value.q))
     array = _array(value)
     if array.shape == (4, 4):
         return rigid_transform("pose", array)
@@ -501,7 +505,8 @@ def _limited(robot: Robot, velocity: ArrayLike | None, acceleration: ArrayLike |
                 "each planned joint"
             )
         rows.append(tuple(values.tolist()))
-    return _with_limits(robot, *rows)
+    # held objects are attached again, so that the limits remain when they are released
+    return reduce(Robot.with_body, robot.attached, _with_limits(robot.arm, *rows))
 
 
 @lru_cache(maxsize=64)

@@ -1,5 +1,5 @@
 """The command line. Exit status: 0 solved or done, 1 no valid motion, 2 bad input, 3 output that could not be
-written, 130 stopped by Ctrl-C."""
+written, 130 stopped by Ctrl-C, 143 by SIGTERM."""
 
 import argparse
 import errno
@@ -14,10 +14,10 @@ from importlib import import_module
 from typing import Any, NoReturn
 
 from robotdiffuse import __version__
-from robotdiffuse.cli.arguments import BAD_INPUT, STOPPED, WRITE_FAILED
+from robotdiffuse.cli.arguments import BAD_INPUT, WRITE_FAILED
 from robotdiffuse.cli.commands import COMMANDS
 from robotdiffuse.core.errors import InputError, OutputError, suggestion
-from robotdiffuse.core.interrupts import handled
+from robotdiffuse.core.interrupts import STOPS, handled
 from robotdiffuse.core.registry import import_modules
 
 RETRY_DELAY = 0.05
@@ -67,9 +67,15 @@ def build_parser() -> Parser:
 
 @contextmanager
 def _repeated_interrupts() -> Iterator[None]:
-    """Within the block, a Ctrl-C that is lost in a callback, as while compiled code is loaded, is repeated
-    until it arrives."""
+    """Within the block, signals of STOPS raise KeyboardInterrupt with their number. One that is lost in a
+    callback, as while compiled code is loaded, is repeated until it arrives."""
     report = sys.unraisablehook
+    stopped_by = signal.SIGINT
+
+    def interrupt(number: int, _frame: object) -> NoReturn:
+        nonlocal stopped_by
+        stopped_by = number
+        raise KeyboardInterrupt(number)
 
     def schedule(lost: Any) -> None:
         if lost.exc_type is KeyboardInterrupt:
@@ -82,10 +88,10 @@ def _repeated_interrupts() -> Iterator[None]:
         if frame.f_code is schedule.__code__:
             signal.setitimer(signal.ITIMER_REAL, RETRY_DELAY)
         else:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(stopped_by)
 
     sys.unraisablehook = schedule
-    with handled(repeat, signal.SIGALRM):
+    with handled(repeat, signal.SIGALRM), handled(interrupt, *STOPS):
         try:
             yield
         finally:
@@ -95,7 +101,8 @@ def _repeated_interrupts() -> Iterator[None]:
 
 @_repeated_interrupts()
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status; bad input is reported as one line on standard error."""
+    """Run one command and return its exit status; bad input is reported on standard error, in one line and
+    the `listed` lines of the InputError."""
     _prepare_streams()
     try:
         arguments = build_parser().parse_args(argv)
@@ -115,7 +122,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not isinstance(cause, KeyboardInterrupt):
             raise
         print("robotdiffuse: stopped", file=sys.stderr)
-        return STOPPED
+        return 128 + next(iter(cause.args), signal.SIGINT)
     except BrokenPipeError:
         return _write_failed()
     except SystemExit as stop:

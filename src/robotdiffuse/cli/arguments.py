@@ -1,20 +1,22 @@
-"""Types of command-line values, for argparse."""
+"""Commands of the command line, options that several commands have, and types of values, for argparse."""
 
 import math
 from argparse import ArgumentTypeError, Namespace
 from argparse import _ActionsContainer as ActionsContainer
+from argparse import _SubParsersAction as Commands
 from collections.abc import Callable, Iterable
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.input_files import MEGABYTE
+from robotdiffuse.core.files import MEGABYTE
+from robotdiffuse.processes.workers import CLUSTERS
 
 # Exit statuses: done; no valid motion; bad input; the output could not be written; stopped by the user.
 SOLVED = 0
 NO_PLAN = 1
 BAD_INPUT = 2
 WRITE_FAILED = 3
-STOPPED = 130
 VIEW_ENDINGS = (".html", ".png")
 """Endings of replays and pictures."""
 ROSBRIDGE_PORT = 9090
@@ -25,11 +27,12 @@ def option(parser: ActionsContainer, spec: str, help: str, *more: Any) -> None:
     """Add an option, or a positional argument.
 
     spec: the option's name and the placeholder of its value in the help: "--seed N". Without a placeholder,
-    the option is a flag. With "*" it may be repeated, with "!" it is required. more: the function that parses
-    the value (None: it stays text), the default, and further keywords of argparse in a dictionary.
+    the option is a flag, unless it has `choices`. With "*" it may be repeated, with "!" it is required. more:
+    the function that parses the value (None: text, not empty), the default, and further keywords of argparse
+    in a dictionary.
     """
     *values, keywords = more if more and isinstance(more[-1], dict) else (*more, {})
-    kind, default, *_ = *values, None, None
+    kind, default, *_ = *values, None, None  # what `more` leaves out is None
     name, *words = spec.split()
     called = [word for word in words if word not in "*!"]
     about: dict[str, Any] = {"default": default}
@@ -45,7 +48,8 @@ def option(parser: ActionsContainer, spec: str, help: str, *more: Any) -> None:
 
 
 def chosen(arguments: Namespace, names: Iterable[str]) -> dict[str, Any]:
-    """The options of these names that the user gave; for all others, the settings keep their defaults."""
+    """The options of these names that the user gave or that have a default, flags included; for all others,
+    the settings keep their defaults."""
     return {name: value for name, value in vars(arguments).items() if name in names and value is not None}
 
 
@@ -124,6 +128,88 @@ def positives(text: str) -> list[float]:
 
 
 def address(text: str) -> tuple[str, int]:
-    """HOST or HOST:PORT."""
+    """HOST or HOST:PORT. An IPv6 address with a port is in brackets; without, brackets are added."""
     host, colon, digits = text.rpartition(":")
-    return (filled(host), port(digits)) if colon else (filled(text), ROSBRIDGE_PORT)
+    if colon and (":" not in host or host.endswith("]")):
+        return filled(host), port(digits)
+    return f"[{text}]" if colon and not text.endswith("]") else filled(text), ROSBRIDGE_PORT
+
+
+Rows = tuple[Any, ...]
+"""Options: each row holds arguments of `option`, the last of them a dictionary if argparse needs keywords."""
+
+
+class Group(NamedTuple):
+    """Options below a title. Without a title, at most one of the options may be given."""
+
+    title: str | None
+    rows: Rows
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command, or a group of commands."""
+
+    name: str
+    help: str
+    description: str
+    run: "str | tuple[Command, ...]"
+    """MODULE:FUNCTION of `robotdiffuse.cli`, which takes the arguments and returns the exit status, or None
+    for 0; or the commands below it."""
+    rows: Rows = ()
+    """The options of the command, and groups of options."""
+    below: str = "actions"
+    """What the help calls the commands below it."""
+
+    def add(self, commands: Commands) -> None:
+        """Add the command to a parser."""
+        parser = commands.add_parser(self.name, help=self.help, description=self.description)
+        parser.set_defaults(run=self.run)
+        for row in self.rows:
+            if not isinstance(row, Group):
+                option(parser, *row)
+                continue
+            title, rows = row
+            group = parser.add_argument_group(title) if title else parser.add_mutually_exclusive_group()
+            for options in rows:
+                option(group, *options)
+        if isinstance(self.run, tuple):
+            actions = parser.add_subparsers(title=self.below, metavar=self.below[:-1].upper(), required=True)
+            for command in self.run:
+                command.add(actions)
+
+
+PORT = 8080
+TOKEN = "ROBOTDIFFUSE_TOKEN"
+LOOPBACK = "127.0.0.1"
+SHELLS = ("bash", "zsh")
+PROBLEM = ("problem PROBLEM", "problem file")
+RESULT = ("result RESULT", "result file (.json) of `robotdiffuse plan --out`")
+INDEX = ("--index INDEX", "which problem of a .jsonl file (default: 0)", natural, 0)
+SEED = ("--seed N", "random seed (default: 0)", natural, 0)
+VIEW = ("--view", "write a replay (.html) and open it")
+PANDA = ("--robot NAME", "bundled name or URDF (default: panda)")
+ALL_CORES = ("--workers N", "processes (default: all cores)", count)
+HALF_OF_CORES = ("--workers N", "planners that run at once (default: half of the cores)", count)
+CPU_TIME = ("--cpu-time", "limits and times are CPU time, for a machine that does other work")
+CLUSTER = ("--cluster", "use the Ray cluster at RAY_ADDRESS", None, None, {"choices": CLUSTERS})
+IGNORE_JOINTS = (
+    "--ignore-joints",
+    "ignore joints of MoveIt files that the robot does not have, with a note, instead of failing",
+)
+IMPORT = (
+    "--import MODULE *",
+    "import MODULE first (also from the current folder), for example to register planners or families; "
+    "repeatable",
+    {"dest": "modules"},
+)
+ADDRESS = (
+    (
+        "--host ADDRESS",
+        "address to listen on (default: 127.0.0.1, this machine only); on other addresses the URL of the "
+        "page ends with a secret token that every visitor needs",
+        None,
+        LOOPBACK,
+    ),
+    ("--port N", f"port; 0 for any free one (default: {PORT})", port, PORT),
+)

@@ -8,7 +8,7 @@ from typing import Any
 from robotdiffuse.cli.arguments import Namespace, check_workers, chosen
 from robotdiffuse.cli.console import progress
 from robotdiffuse.core.errors import InputError, counted
-from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.files import write_atomically
 from robotdiffuse.core.tables import Table, show
 from robotdiffuse.core.types import Path as Waypoints
 from robotdiffuse.evaluation import paper
@@ -23,8 +23,8 @@ from robotdiffuse.evaluation.bench_report import (
     motions_to_replay,
 )
 from robotdiffuse.evaluation.checks import confirm
-from robotdiffuse.evaluation.problem_sets import hard_cases
 from robotdiffuse.evaluation.report import Report
+from robotdiffuse.evaluation.runs import hard_cases
 from robotdiffuse.visualization.picture import PictureSettings, write_comparison, write_picture
 from robotdiffuse.visualization.replay_page import GalleryEntry, write_gallery
 

@@ -3,17 +3,6 @@
 from inspect import signature
 
 from robotdiffuse.cli.arguments import (
-    address,
-    assignment,
-    count,
-    megabytes,
-    natural,
-    not_negative,
-    pair,
-    port,
-    positive,
-)
-from robotdiffuse.cli.command import (
     ADDRESS,
     IGNORE_JOINTS,
     IMPORT,
@@ -26,6 +15,15 @@ from robotdiffuse.cli.command import (
     VIEW,
     Command,
     Group,
+    address,
+    assignment,
+    count,
+    megabytes,
+    natural,
+    not_negative,
+    pair,
+    port,
+    positive,
 )
 from robotdiffuse.cli.study_commands import BENCH, DATA, REPRODUCE, TRAIN
 from robotdiffuse.planning import described_arguments, plan
@@ -56,7 +54,7 @@ PLANNING = (
             (
                 "--weights FOLDER",
                 "weights of a learned planner: a folder of `robotdiffuse train`, or panda_points for the "
-                "bundled network that gets no clearances (default: the robot's weights)",
+                "bundled network without clearances as inputs (default: the robot's weights)",
             ),
             (
                 "--set NAME=VALUE *",
@@ -96,7 +94,7 @@ PLANNING = (
         "plan a bundled problem and draw the motion",
         "Plan a bundled problem with obstacles, and write demo.png and demo.html to the current folder; with "
         "--explore, observe the obstacles by cameras on the way.",
-        "demo:run_demo",
+        "explore:run_demo",
         (
             Group(
                 None,
@@ -144,7 +142,7 @@ PLANNING = (
             SEED,
             (
                 "--out FILE *",
-                "replay with what was known at each time (.html), or a strip of pictures, one a step (.png); "
+                "replay with what was known at each time (.html), or pictures of up to 6 steps (.png); "
                 "repeatable",
             ),
             VIEW,
@@ -280,7 +278,7 @@ CHECKS = (
             (
                 "results RESULT",
                 "result file (.json) of `robotdiffuse plan --out`, or a problem file; several results must "
-                "be of one problem",
+                "share robot and scene",
                 {"nargs": "+"},
             ),
             (
@@ -315,7 +313,7 @@ CHECKS = (
         "Validate the motion of a result file again, and write it for other programs: .mcap (a scene that "
         "Foxglove opens, with ROS 2 messages), .rosbag2 (a ROS 2 bag, a folder), .rrd (Rerun), .yaml (a ROS "
         "2 JointTrajectory), .csv and .json.",
-        "export:run_export",
+        "verify:run_export",
         (
             RESULT,
             ("--out FILE * !", "file to write; repeatable"),
@@ -331,7 +329,7 @@ CHECKS = (
         "publish",
         "publish a result to ROS through rosbridge",
         "Validate the motion of a result file again, and publish it as a ROS JointTrajectory.",
-        "export:run_publish",
+        "verify:run_publish",
         (
             RESULT,
             ("--to HOST[:PORT] !", "rosbridge server (port: 9090)", address),
@@ -358,7 +356,7 @@ ROBOTS = (
                 "show joints, limits and collision model",
                 "Show joints, limits and collision model of a robot.",
                 "robot:run_info",
-                (("robot ROBOT", "a bundled name, a prepared folder or a URDF file"),),
+                (("robot ROBOT", "a bundled or added name, a prepared folder, a URDF or a MuJoCo model"),),
             ),
             Command(
                 "add",
@@ -368,7 +366,10 @@ ROBOTS = (
                 "name.",
                 "robot:run_add",
                 (
-                    ("urdf URDF", "URDF of an arm, or xacro file; compiling xacro runs the code in it"),
+                    (
+                        "urdf URDF",
+                        "URDF of an arm, MuJoCo model, or xacro file; compiling xacro runs the code in it",
+                    ),
                     ("--name NAME", "name that problems use (default: the URDF's)"),
                     ("--out FOLDER", "folder to write (default: one in the user's robots)"),
                     (

@@ -29,7 +29,8 @@ BALL = Sphere([0.0, 0.0, -5.0], 0.1)
 
 @contextmanager
 def compiling_ahead(picture: bool) -> Iterator[None]:
-    """While the block runs, the first compilation in this process starts the second process.
+    """While the block runs, the first compilation in this process starts the second process, unless the
+    machine has only one core.
 
     picture: whether the second process also compiles the code that draws pictures.
     """
@@ -39,8 +40,7 @@ def compiling_ahead(picture: bool) -> Iterator[None]:
         nothing = subprocess.DEVNULL
         subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing)
 
-    single_core = (os.cpu_count() or 1) < 2
-    loading.on_first_compilation = None if single_core else start
+    loading.on_first_compilation = None if (os.cpu_count() or 1) < 2 else start
     try:
         yield
     finally:

@@ -5,8 +5,7 @@ from argparse import ArgumentParser
 from collections.abc import Iterator
 
 from robotdiffuse.cli import build_parser
-from robotdiffuse.cli.arguments import Namespace
-from robotdiffuse.cli.command import Commands
+from robotdiffuse.cli.arguments import Commands, Namespace
 from robotdiffuse.core.tables import Column, Table, show
 from robotdiffuse.planning import PLANNERS, planner_settings
 from robotdiffuse.problems.fields import problem_schema
@@ -18,9 +17,9 @@ def run_planner_list(arguments: Namespace) -> None:
 
 
 def run_planner_info(arguments: Namespace) -> None:
-    settings = planner_settings(arguments.planner, ())
     rows = [
-        (setting.name, setting.value, setting.rule, setting.description) for setting in settings.describe()
+        (setting.name, setting.value, setting.rule, setting.description)
+        for setting in planner_settings(arguments.planner, ()).describe()
     ]
     columns = ("setting", *(Column(name, left=True) for name in ("default", "values", "description")))
     show(Table.of(f"{arguments.planner}: {PLANNERS[arguments.planner].description}", columns, rows))

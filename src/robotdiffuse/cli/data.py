@@ -9,7 +9,7 @@ from robotdiffuse.cli.arguments import Namespace, check_workers, chosen
 from robotdiffuse.cli.console import progress
 from robotdiffuse.cli.view import open_in_browser
 from robotdiffuse.core.errors import InputError, counted
-from robotdiffuse.core.output_files import check_output
+from robotdiffuse.core.files import check_output
 from robotdiffuse.core.tables import show
 from robotdiffuse.datasets.external import export_npz, import_npz
 from robotdiffuse.datasets.shards import motion_of, random_rows, read_manifest, scenes_of
@@ -81,8 +81,9 @@ def _gallery_entries(folder: Path, robot: Robot, number: int, seed: int) -> Iter
     manifest = read_manifest(folder)
     for shard, rows in random_rows(folder, number, seed):
         for row in rows.tolist():
-            family = list(manifest.families)[int(shard["family"][row])]
+            # first, since it checks the index of the family
             scene = scenes_of(manifest, shard, slice(row, row + 1)).scene(0)
+            family = list(manifest.families)[int(shard["family"][row])]
             cost, detour, clearance = (float(shard[name][row]) for name in ("cost", "detour", "clearance"))
             line = "trivial" if shard["line_free"][row] else f"detour {detour:.2f}"
             caption = f"{cost:.2f} rad · {line} · {100 * clearance:.1f} cm clear"

@@ -1,14 +1,12 @@
 """The command `robotdiffuse live`, and the page of `robotdiffuse explore --live`."""
 
-import os
-import signal
-import sys
 import threading
 from typing import NoReturn
 
 from rich.console import Console
 
-from robotdiffuse.cli.arguments import STOPPED, Namespace, chosen
+from robotdiffuse.cli.arguments import Namespace, chosen
+from robotdiffuse.core.interrupts import exit_on_interrupt
 from robotdiffuse.planning.exploration.steps import ExplorerSettings
 from robotdiffuse.problems.files import load_problem
 from robotdiffuse.visualization.live.exploration import ExplorationPage, ExplorationSession
@@ -35,11 +33,8 @@ def show_live(arguments: Namespace, settings: ExplorerSettings) -> NoReturn:
 
 def serve_until_stopped(page: LivePage) -> NoReturn:
     """Print the address of a page, serve it until Ctrl-C, and end the process."""
-    ended = threading.Event()
-    for stop_signal in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(stop_signal, lambda *_: ended.set())
-    print(f"the page is at {page.server.url} (stop with Ctrl-C)", flush=True)
-    ended.wait()
-    page.close()
-    print("robotdiffuse: stopped", file=sys.stderr, flush=True)
-    os._exit(STOPPED)  # a normal exit would wait for threads that plan or compile
+    # at once: closing the page first would wait for a drawing, which may be compiling
+    with exit_on_interrupt():
+        print(f"the page is at {page.server.url} (stop with Ctrl-C)", flush=True)
+        while True:
+            threading.Event().wait()

@@ -8,8 +8,8 @@ from robotdiffuse.cli.arguments import NO_PLAN, SOLVED, VIEW_ENDINGS, Namespace,
 from robotdiffuse.cli.compile_ahead import compiling_ahead
 from robotdiffuse.cli.console import Spinner, print_next_view, print_result
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.files import check_output
 from robotdiffuse.core.interrupts import exit_on_interrupt
-from robotdiffuse.core.output_files import check_output
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import PlanResult
 from robotdiffuse.interop import WRITERS, check_export, write_motion
@@ -31,8 +31,10 @@ def run_plan(arguments: Namespace) -> int:
     picture = any(file.suffix.lower() == ".png" for file in outputs)
     result = load_and_plan(problem, name, settings, arguments.weights, picture, **asdict(request))
     # files first: printing into `| head` can end the process
-    written = [file for file in outputs if _write(problem, result, file)]
-    print_result(result, asked_clearance(problem, name, request.clearance))
+    try:
+        written = [file for file in outputs if _write(problem, result, file)]
+    finally:  # also if a file cannot be written, for example because the disk is full
+        print_result(result, asked_clearance(problem, name, request.clearance))
     if arguments.next_view and result.path is not None:
         print_next_view(problem, result)
     for file in outputs:

@@ -34,10 +34,18 @@ def run_list(arguments: Namespace) -> None:
             continue
         spheres = sum(map(len, robot.spheres.values()))
         weights = "no" if weights_for("model", robot) is None else "yes"
-        refused = read_source(place).get("refused")
-        rows.append((name, robot.dof, spheres, len(robot.checked_pairs()), refused, weights, str(place)))
-    refused = Column("false collisions", "%", ".1f", scale=100.0)
-    columns = ("robot", "joints", "spheres", "checked pairs", refused, "weights", Column("folder", left=True))
+        false_share = read_source(place).get("refused")
+        rows.append((name, robot.dof, spheres, len(robot.checked_pairs()), false_share, weights, str(place)))
+    false_column = Column("false collisions", "%", ".1f", scale=100.0)
+    columns = (
+        "robot",
+        "joints",
+        "spheres",
+        "checked pairs",
+        false_column,
+        "weights",
+        Column("folder", left=True),
+    )
     show(Table.of("", columns, rows))
 
 
@@ -86,21 +94,20 @@ def print_preparation(report: "AddReport") -> None:
         for link in report.links
     ]
     fractions = [
-        Column(name, "%", ".1f", scale=100.0)
-        for name in ("colliding", "falsely by parts", "falsely by spheres")
+        Column(name, "%", ".1f", scale=100.0) for name in ("colliding", "false by parts", "false by spheres")
     ]
-    falsely = report.false_collisions
+    false_collisions = report.false_collisions
     parts = sum(link.parts for link in report.links)
     pairs = [
         (", ".join(pair.links), pair.colliding, pair.by_parts, pair.by_spheres)
-        for pair in falsely.pairs[:MAX_PAIRS]
+        for pair in false_collisions.pairs[:MAX_PAIRS]
     ]
     summary = [
         ("convex parts, spheres", f"{parts}, {report.sphere_count}"),
-        ("configurations free of self-collision", f"{falsely.free:.1%}"),
+        ("configurations free of self-collision", f"{false_collisions.free:.1%}"),
         (
             "of these in false collision by convex parts, by spheres",
-            f"{falsely.by_parts:.1%}, {falsely.by_spheres:.1%}",
+            f"{false_collisions.by_parts:.1%}, {false_collisions.by_spheres:.1%}",
         ),
         ("processor time, memory", f"{report.seconds:.0f} s, {report.memory / 2**20:.0f} MiB"),
     ]

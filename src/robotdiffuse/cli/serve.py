@@ -3,19 +3,18 @@
 import os
 from collections.abc import Sequence
 
-from robotdiffuse.cli.arguments import Namespace, chosen
-from robotdiffuse.cli.command import TOKEN
+from robotdiffuse.cli.arguments import TOKEN, Namespace, chosen
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.network import is_loopback
 from robotdiffuse.robots import ROBOTS, known_robots, load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.server.server import serve
+from robotdiffuse.server.app import serve
 from robotdiffuse.server.settings import ServeSettings
 
 
 def run(arguments: Namespace) -> None:
     options = chosen(arguments, ServeSettings.__dataclass_fields__)
-    settings = ServeSettings(**options, token=os.environ.get(TOKEN, ""))
+    settings = ServeSettings(**options, token=os.environ.get(TOKEN, "").strip())
     if not is_loopback(settings.host) and not settings.token:
         raise InputError(f"host is {shown(settings.host)}, which others can reach: set a token in {TOKEN}")
     serve(served_robots(arguments.robot), settings, lambda line: print(line, flush=True))

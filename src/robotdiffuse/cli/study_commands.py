@@ -2,8 +2,7 @@
 
 import os
 
-from robotdiffuse.cli.arguments import count, names, natural, not_negative, positive, positives, share, shares
-from robotdiffuse.cli.command import (
+from robotdiffuse.cli.arguments import (
     ALL_CORES,
     CLUSTER,
     CPU_TIME,
@@ -13,6 +12,14 @@ from robotdiffuse.cli.command import (
     SEED,
     Command,
     Group,
+    count,
+    names,
+    natural,
+    not_negative,
+    positive,
+    positives,
+    share,
+    shares,
 )
 from robotdiffuse.problems.families import FAMILIES
 
@@ -47,7 +54,7 @@ DATA = Command(
                     "paper)",
                     share,
                 ),
-                ("--target KIND", "goal type: tip position (default) or full pose"),
+                ("--target KIND", "goals reach a tip position (position, default) or its full pose (pose)"),
                 ("--goals N", "maximum number of goal configurations per target (default: 10)", count),
                 ("--waypoints N", "waypoints of a motion (default: 254)", count),
                 ("--timing KIND", "waypoints equally spaced in arc length (arc, default) or in time (time)"),
@@ -332,13 +339,14 @@ BENCH = Command(
             (
                 ("folder FOLDER", "folder of `bench run`"),
                 ("--count N", "check only the first N problems of each set (default: all)", count),
+                IMPORT,
             ),
         ),
     ),
 )
 TABLE_1 = (
     ("--out FOLDER !", "folder for problems, results, page"),
-    ("--problems N", "nontrivial problems for each kind of goal (default: 60)", count),
+    ("--problems N", "non-trivial problems for each kind of goal (default: 60)", count),
     ("--time-limit S", "time limit of a call [s] (default: 10)", positive),
     (
         "--paper-weights FOLDER",

@@ -11,12 +11,12 @@ from typing import Any
 from robotdiffuse.cli.arguments import Namespace, chosen
 from robotdiffuse.cli.console import progress
 from robotdiffuse.core.errors import InputError, counted, needs, shown
-from robotdiffuse.core.output_files import lock_folder, write_atomically
+from robotdiffuse.core.files import lock_folder, write_atomically
 from robotdiffuse.generation import GenerationSettings, generate
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
 from robotdiffuse.learning.weight_files import BUNDLED, user_weights
 from robotdiffuse.problems.families.scaled import scale_for
-from robotdiffuse.robots import load_robot
+from robotdiffuse.robots import load_robot, names_a_file
 from robotdiffuse.robots.robot import Robot
 
 with needs("torch", "train"):
@@ -70,7 +70,7 @@ def run_planner(arguments: Namespace) -> None:
     options = chosen(arguments, ("data", "encoder", "robot", "device", *TRAINING_OPTIONS, *MODEL_OPTIONS))
     config = CONFIGS[arguments.config].changes
     if "denoiser" in options and config.get("denoiser_settings") is not None:
-        # the config's settings are for its own denoiser; another gets those of its paper, or its defaults
+        # these settings are for the config's own denoiser; another gets its PAPER_SIZES, or its defaults
         options["denoiser_settings"] = PAPER_SIZES.get(arguments.denoiser) or DENOISERS.defaults(
             arguments.denoiser
         )
@@ -203,7 +203,7 @@ def train_for_robot(
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise InputError("torchrun only trains: generate the data first, then give --data")
     robot = load_robot(source)
-    source = str(Path(source).resolve()) if Path(source).exists() else source
+    source = str(Path(source).resolve()) if names_a_file(source) else source
     weights_dir = user_weights(robot)
     work = weights_dir.with_name("training") if out is None else Path(out)
     data = data_settings(source, robot, motions, options.get("seed"))
@@ -214,6 +214,7 @@ def train_for_robot(
     settings: PlannerTraining = make_settings(
         defaults | options | {"data": str(work / "data"), "robot": source}
     )
+    # raise InputError for a missing device or encoder now, before the data are generated
     Processes(settings.device)
     if "encoder" in options and settings.encoder is not None and not settings.jointly:
         load_encoder(settings.encoder)

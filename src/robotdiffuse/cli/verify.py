@@ -1,4 +1,4 @@
-"""The commands `robotdiffuse verify` and `certificate check`."""
+"""The commands on results: `robotdiffuse verify`, `certificate check`, `export` and `publish`."""
 
 import math
 from pathlib import Path
@@ -6,18 +6,18 @@ from pathlib import Path
 from robotdiffuse.cli.arguments import Namespace
 from robotdiffuse.cli.console import clearances
 from robotdiffuse.core.errors import InputError, counted, joined, located
-from robotdiffuse.core.output_files import check_output
+from robotdiffuse.core.files import check_output
 from robotdiffuse.core.types import NO_PROBLEM, PlanResult, Trajectory, load_result
 from robotdiffuse.core.types import Path as Waypoints
-from robotdiffuse.interop import read_motion
-from robotdiffuse.interop.recorded_motion import motion_of_robot, problem_of_motion
+from robotdiffuse.interop import check_export, read_motion, write_motion
+from robotdiffuse.interop.recorded_motion import motion_of_robot, problem_of_motion, publish
 from robotdiffuse.problems.files import load_problem, problem_from_record
 from robotdiffuse.problems.moveit import read_moveit_scene
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import DATA, ROBOTS, load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import contact_notes
-from robotdiffuse.validation.validator import verify, violations
+from robotdiffuse.validation.validator import verify, verify_trajectory, violations
 
 
 def run_verify(arguments: Namespace) -> int:
@@ -57,8 +57,8 @@ def _validated(problem: Problem, what: str, motion: Waypoints | Trajectory, ever
 
 
 def _jerk(share: float) -> str:
-    """A text that compares the largest jerk with its limit. share: the largest fraction of a joint's
-    limit."""
+    """A text about the largest jerk. share: its largest fraction of a joint's limit; infinite if an
+    acceleration jumps."""
     if math.isinf(share):
         return "accelerations jump at the ends, which some controllers refuse"
     return f"jerk at most {100 * share:.0f} % of the limits"
@@ -97,14 +97,26 @@ def _stored_problem(file: str) -> Problem:
     return problem
 
 
+NO_TOPICS = (".json", ".csv", ".yaml", ".yml")
+"""Endings of files of motions that have no topics."""
+
+
 def _read(
     arguments: Namespace,
 ) -> tuple[Problem, dict[str, Waypoints | Trajectory], tuple[str, ...]]:
-    """The problem, the motions to validate by name, and notes on changes made to read them."""
+    """The problem, the motions to validate with their labels, and notes on what was changed in reading."""
     if (arguments.scene is None) != (arguments.robot is None):
-        raise InputError("--scene and --robot belong together: a planning scene does not name its robot")
+        option, lacking = ("--robot", "--scene") if arguments.scene is None else ("--scene", "--robot")
+        raise InputError(
+            f"--scene and --robot belong together: {option} is given without {lacking}; give both or neither"
+        )
+    ending = Path(arguments.motion).suffix.lower()
+    if arguments.topic is not None and ending in NO_TOPICS:
+        raise InputError(f"--topic is for bags and MCAP files; {arguments.motion} has no topics")
+    if arguments.index and arguments.problem is None:
+        raise InputError("--index says which problem of --problem FILE; give --problem, or leave it out")
     only_motion = arguments.problem is None and arguments.scene is None
-    if only_motion and arguments.motion.lower().endswith(".json"):
+    if only_motion and ending == ".json":
         result, problem = read_solved(arguments.motion)
         motions = {"path": result.path, "trajectory": result.trajectory}
         return problem, {label: motion for label, motion in motions.items() if motion is not None}, ()
@@ -159,10 +171,42 @@ def described(robot: Robot) -> str:
     name = robot.name if robot.source is None else f"{robot.name} from {robot.source}"
     if robot.name not in ROBOTS:
         return f"{name}, not bundled: the proof holds for the shapes and joints in its files"
-    locked = {joint: value for joint, value in robot.locked.items() if joint not in robot.joint_names}
-    bundled = load_robot(DATA / robot.name, locked)
+    bundled = load_robot(DATA / robot.name, robot.locked)
     changes = differences("robot", robot_parts(bundled), robot_parts(robot))
     if not changes:
         return f"{name}, the bundled one"
     listed = joined([line.removeprefix("robot: ") for line in changes], MAX_CHANGES)
     return f"{name}, not the bundled one: {listed}"
+
+
+def run_export(arguments: Namespace) -> None:
+    outputs = [check_export(file, arguments.result) for file in arguments.out]
+    problem, trajectory = validated_motion(arguments.result, arguments.rate)
+    for file in outputs:
+        write_motion(problem, trajectory, file)
+        print(f"wrote {file}")
+
+
+def validated_motion(file: str, rate: float | None = None) -> tuple[Problem, Trajectory]:
+    """The problem and the motion of a result file, resampled at `rate` [Hz] if it is given.
+
+    Raises InputError if the file holds no problem or no timed motion, and if the validator rejects the
+    motion, because other programs may execute it.
+    """
+
+    result, problem = read_solved(file)
+    if result.trajectory is None:
+        raise InputError(f"{file} holds a path without times; plan again to get a trajectory")
+    trajectory = result.trajectory if rate is None else result.trajectory.resample(rate)
+    violation = verify_trajectory(problem, trajectory).violation
+    if violation is not None:
+        rows = "" if rate is None else f" with rows at {rate:g} Hz"
+        raise InputError(f"{file} is not exported: its motion{rows} is not valid: {violation.message}")
+    return problem, trajectory
+
+
+def run_publish(arguments: Namespace) -> None:
+    host, port = arguments.to
+    _, trajectory = validated_motion(arguments.result)
+    publish(trajectory, host, port, arguments.topic, arguments.timeout)
+    print(f"published {counted(len(trajectory.times), 'row')} on {arguments.topic} at {host}:{port}")

@@ -13,8 +13,7 @@ import numpy as np
 from robotdiffuse.cli.arguments import NO_PLAN, SOLVED, VIEW_ENDINGS, Namespace
 from robotdiffuse.cli.verify import read_result, read_solved
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.input_files import read_json
-from robotdiffuse.core.output_files import check_output
+from robotdiffuse.core.files import check_output, read_json
 from robotdiffuse.core.tables import Column, Table, show
 from robotdiffuse.core.types import PROBLEM_ENDINGS, PlanResult, Trajectory
 from robotdiffuse.planning.pipeline.unknown_space import policy_for, predicted_obstacles
@@ -85,6 +84,9 @@ def _read(file: str) -> tuple[PlanResult | None, Problem]:
 def run_view(arguments: Namespace) -> None:
     files = arguments.out or [f"{Path(arguments.results[0]).stem}.html"]
     outputs = [check_output(file, VIEW_ENDINGS) for file in files]
+    pictures = any(file.suffix.lower() == ".png" for file in outputs)
+    if arguments.shell and not (pictures and len(arguments.results) > 1):
+        raise InputError("--shell is for pictures (.png) of several results; leave it out")
     if len(arguments.results) == 1:
         result, problem = _read(arguments.results[0])
         write = partial(draw, problem, result)
@@ -100,18 +102,23 @@ def run_view(arguments: Namespace) -> None:
 
 def _read_several(files: list[str]) -> tuple[Problem, dict[str, PlanResult]]:
     """The problem of the first of several result files, and the solved results by the names of the files.
-    Raises InputError if the results are for different robots or scenes, or if two names are equal."""
+    Raises InputError as `read_solved` does, if the results are for different robots, bases, scenes or moving
+    obstacles, and if two names are equal."""
 
     names = [Path(file).stem for file in files]
     (result, problem), *further_results = map(read_solved, files)
     if len(set(names)) < len(names):
         raise InputError(f"results are {', '.join(files)}; two have the same name")
+    record = problem_record(problem)
     for name, (_, other_problem) in zip(names[1:], further_results, strict=True):
-        if (
-            problem_record(other_problem)["scene"] != problem_record(problem)["scene"]
-            or other_problem.robot != problem.robot
+        other_record = problem_record(other_problem)
+        if other_problem.robot != problem.robot or any(
+            other_record.get(key) != record.get(key) for key in ("base", "scene", "moving")
         ):
-            raise InputError(f"{name} is of another robot or scene than {names[0]}; results must share both")
+            raise InputError(
+                f"{name} has another robot, base, scene or moving obstacles than {names[0]}; results must "
+                "share them"
+            )
     return problem, dict(zip(names, (result, *(solution for solution, _ in further_results)), strict=True))
 
 
@@ -154,6 +161,7 @@ def run_simulate(arguments: Namespace) -> int:
     rates = np.gradient(executed.positions, executed.times, axis=0)
     motion = Trajectory(executed.joint_names, executed.times, executed.positions, rates, 0 * rates)
     for file in outputs:
-        draw(problem, replace(result, trajectory=motion), file)
+        # the clearance was certified for the planned motion
+        draw(problem, replace(result, trajectory=motion, min_clearance=None), file)
         print(f"wrote {file}")
     return SOLVED if executed.free else NO_PLAN

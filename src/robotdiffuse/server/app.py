@@ -1,14 +1,19 @@
-"""The HTTP application: endpoints, limits of requests, and errors as one line of JSON."""
+"""The HTTP application: endpoints, limits of requests, and errors as one line of JSON; and the server that
+runs it."""
 
 import asyncio
 import json
+import logging
 import secrets
+import signal
+import socket
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal, get_type_hints
 
+import uvicorn
 from fastapi import FastAPI, Header, Request, Response
 from fastapi.openapi.constants import REF_TEMPLATE
 from fastapi.responses import JSONResponse, PlainTextResponse
@@ -20,19 +25,20 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from robotdiffuse import __version__
-from robotdiffuse.core.errors import shown
-from robotdiffuse.core.network import is_loopback, named_host
+from robotdiffuse.core.errors import described, shown
+from robotdiffuse.core.files import JsonObject
+from robotdiffuse.core.network import is_loopback, listening, named_host
 from robotdiffuse.core.types import SampleRate, Status
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, described_arguments
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.problems.fields import problem_schema
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.server.connection import REFUSED, log_access
-from robotdiffuse.server.settings import ServeSettings
+from robotdiffuse.server.connection import LOG, REFUSED, Connection, log_access
+from robotdiffuse.server.settings import GRACE_TIME, ServeSettings
 from robotdiffuse.server.worker import PLAN, VERIFY, Answer, failed
 from robotdiffuse.server.worker_pool import STOPPING, RequestError, WorkerPool
 
-PROBLEM: dict[str, Any] = {
+PROBLEM: JsonObject = {
     "robot": "panda",
     "scene": [{"box": {"center": [0.45, 0.0, 0.3], "size": [0.3, 0.05, 0.6], "name": "wall"}}],
     "start": [0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785],
@@ -43,7 +49,7 @@ JOINT_NAMES = [f"panda_joint{i}" for i in range(1, 8)]
 VERIFY_EXAMPLE: Any = {"problem": PROBLEM, "path": {"joint_names": JOINT_NAMES, "positions": WAYPOINTS}}
 
 Rows = list[list[float]]
-ProblemField = Annotated[dict[str, Any], Field(description="as in a problem file", examples=[PROBLEM])]
+ProblemField = Annotated[JsonObject, Field(description="as in a problem file", examples=[PROBLEM])]
 
 
 class Error(BaseModel):
@@ -121,7 +127,8 @@ class PlanAnswer(BaseModel):
 
 
 class Violation(BaseModel):
-    """The first thing that is wrong with a motion."""
+    """The first thing that is wrong with a motion. `time` is in seconds or, for a path, the index of a
+    waypoint plus the traveled fraction of the segment after it."""
 
     model_config = ConfigDict(extra="allow")
     kind: str
@@ -213,10 +220,10 @@ ERRORS = {
     404: "no such request is running",
     408: "the request did not arrive in time",
     409: "the request was cancelled, or its X-Request-ID is in use",
-    413: "the request is too large",
+    413: "the request is too large, or needs more memory than a worker may use",
     415: "wrong Content-Type",
     421: "wrong Host",
-    429: "the queue is full; Retry-After says when to try again",
+    429: "the queue is full, and Retry-After says when to try again; or too much data is arriving",
     500: "the worker failed on this request",
     503: "the server is stopping, or the request took too long",
 }
@@ -224,6 +231,7 @@ REQUEST_ERRORS = (400, 401, 408, 409, 413, 415, 421, 429, 500, 503)
 RequestID = Annotated[str, Header(alias=REQUEST_ID, description="names the request, to cancel it")]
 
 
+@dataclass(eq=False)
 class Access:
     """Middleware: checks the bearer token and, on loopback, that the Host header names this machine; logs a
     line for each request.
@@ -232,9 +240,8 @@ class Access:
     own that resolves to 127.0.0.1.
     """
 
-    def __init__(self, app: ASGIApp, settings: ServeSettings) -> None:
-        self.app = app
-        self.settings = settings
+    app: ASGIApp
+    settings: ServeSettings
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         began = time.monotonic()
@@ -260,9 +267,12 @@ class Access:
 
         try:
             await (self._refusal(request) or self.app)(scope, receiving, sending)
-        except asyncio.CancelledError:  # the second SIGINT or SIGTERM stops the server at once
+        except asyncio.CancelledError:  # a second signal, or the end of `timeout_graceful_shutdown`
             if code == CLIENT_GONE:  # no answer has begun
                 await _error(503, STOPPING)(scope, receive, sending)
+        except Exception:
+            code = 500  # the handler in `make_app` answers outside of this middleware
+            raise
         finally:
             name = request.headers.get(REQUEST_ID, "")
             target = f"{scope['method']} {scope['raw_path'].decode('latin-1')}"
@@ -275,7 +285,10 @@ class Access:
             return _error(421, f"the host is {shown(host)}; this server is known as localhost")
         authorization = request.headers.get("authorization", "")
         token = self.settings.token
-        if token and not secrets.compare_digest(authorization.encode(), f"Bearer {token}".encode()):
+        # header values are decoded as Latin-1, and most clients send UTF-8
+        sent = (authorization.encode(), authorization.encode("latin-1", "replace"))
+        right = f"Bearer {token}".encode()
+        if token and not any(secrets.compare_digest(value, right) for value in sent):
             text = "the header Authorization must be: Bearer TOKEN"
             return _error(401, text, {"WWW-Authenticate": "Bearer"})
         return None
@@ -293,7 +306,7 @@ def make_app(pool: WorkerPool, robots: dict[str, Robot]) -> FastAPI:
     app.add_middleware(Access, settings=pool.settings)
     app.exception_handler(RequestError)(lambda _, error: _error(error.code, str(error), error.headers))
     app.exception_handler(HTTPException)(_http_error)
-    app.exception_handler(Exception)(lambda _, error: _error(500, f"{type(error).__name__}: {error}"))
+    app.exception_handler(Exception)(lambda _, error: _error(500, described(error)))
     _add_requests(app, pool, pool.settings)
     _add_lists(app, pool, robots)
     _describe_bodies(app)
@@ -320,11 +333,11 @@ def _describe_bodies(app: FastAPI) -> None:
             operation["responses"].pop("422", None)
 
 
-def _errors(*codes: int) -> dict[int | str, dict[str, Any]]:
+def _errors(*codes: int) -> dict[int | str, JsonObject]:
     return {code: {"model": Error, "description": ERRORS[code]} for code in codes}
 
 
-def _body(model: type[BaseModel] | None, description: str) -> dict[str, Any]:
+def _body(model: type[BaseModel] | None, description: str) -> JsonObject:
     """The OpenAPI description of a request whose body the endpoint reads itself. `model` is the type of the
     body; None: JSON lines, each a PlanBody."""
     schema = {"type": "string"} if model is None else {"$ref": REF_TEMPLATE.format(model=model.__name__)}
@@ -375,7 +388,7 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
     )
     async def batch(request: Request, name: RequestID = "") -> Response:
         """Each line of the answer is the answer of /plan to one line of the request, in the same order; a
-        line is sent as soon as it and all lines before it are done."""
+        line is sent as soon as it and all lines before it are done. Blank lines are ignored."""
 
         async def write(send: Send) -> None:
             body = await read_body(request, pool, LINES)
@@ -400,9 +413,12 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
     )
     async def cancel(name: str) -> Response:
         """Cancels the request that was sent with this name in its header X-Request-ID."""
-        if name not in running:
+        # header values are decoded as Latin-1, and most clients send UTF-8
+        in_header = name.encode("utf-8", "replace").decode("latin-1")
+        cancel_request = running.get(name) or running.get(in_header)
+        if cancel_request is None:
             raise RequestError(404, f"no request {shown(name)} is running")
-        running[name]()
+        cancel_request()
         return JSONResponse({"cancelled": name})
 
 
@@ -502,7 +518,8 @@ async def read_body(request: Request, pool: WorkerPool, kind: str) -> bytes:
             if len(body) > max_size:
                 raise too_large
             if pool.arriving_bytes > MAX_ARRIVING * max_size:
-                raise RequestError(429, "too many requests are arriving")
+                limit_text = f"{MAX_ARRIVING * max_size} bytes"
+                raise RequestError(429, f"unfinished requests hold more than {limit_text}; try again later")
     except ClientDisconnect:
         raise RequestError(CLIENT_GONE, "the client closed the connection") from None
     finally:
@@ -541,7 +558,7 @@ def _http_error(request: Request, error: Any) -> Response:
 
 LINES = "application/x-ndjson"
 CLIENT_GONE = 499
-"""Status code of a request whose client closed the connection; nobody reads it."""
+"""Status code, for the log only, of a request whose client closed the connection."""
 
 
 async def wait_for_disconnect(request: Request) -> None:
@@ -599,3 +616,93 @@ class StreamedResponse(Response):
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         await self.write(send)
+
+
+KEEP_ALIVE_TIMEOUT = 5
+"""Time that a connection stays open after an answer [s]."""
+SIGNALS = signal.SIGINT, signal.SIGTERM
+
+
+class _Server(uvicorn.Server):
+    """At the first signal, it refuses waiting requests, lets running ones finish within
+    `timeout_graceful_shutdown`, and stops; at the second signal, it stops at once."""
+
+    def __init__(self, config: uvicorn.Config, pool: WorkerPool) -> None:
+        super().__init__(config)
+        self.pool = pool
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        loop = asyncio.get_running_loop()
+        for number in SIGNALS:
+            loop.add_signal_handler(number, self._on_signal)
+        try:
+            yield
+        finally:
+            for number in SIGNALS:
+                loop.remove_signal_handler(number)
+
+    def _on_signal(self) -> None:
+        self.pool.stop()
+        self.force_exit = self.should_exit
+        self.should_exit = True
+
+
+def serve(robots: dict[str, Robot], settings: ServeSettings, say: Callable[[str], None] = print) -> None:
+    """Answer requests until SIGTERM or Ctrl-C. `say` receives a line with the address, and a line when the
+    server is ready; standard error gets a line for each request.
+
+    Raises InputError if the address cannot be listened on, for more than MAX_WORKERS workers, and if the
+    first worker cannot be started.
+    """
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
+    LOG.addHandler(handler)
+    LOG.setLevel(logging.INFO)
+    try:
+        with listening(settings.host, settings.port) as listener:
+            asyncio.run(_serve(robots, settings, listener, say))
+    finally:
+        LOG.removeHandler(handler)
+
+
+async def _serve(
+    robots: dict[str, Robot], settings: ServeSettings, listener: socket.socket, say: Callable[[str], None]
+) -> None:
+    pool = WorkerPool(robots, settings)
+    config = uvicorn.Config(
+        make_app(pool, robots),
+        lifespan="off",
+        http=Connection,
+        log_level="error",  # `Connection` and `Access` log mistakes of clients
+        access_log=False,
+        server_header=False,
+        timeout_keep_alive=KEEP_ALIVE_TIMEOUT,
+        timeout_graceful_shutdown=int(settings.max_time_limit + GRACE_TIME) + 1,
+        ws="none",
+    )
+    server = _Server(config, pool)
+
+    def started(task: asyncio.Future[None]) -> None:
+        if task.cancelled() or task.exception() is not None:
+            server.should_exit = True
+        else:
+            remaining = settings.workers - 1
+            others = f"; {remaining} more {'is' if remaining == 1 else 'are'} starting" if remaining else ""
+            say(f"ready, with 1 worker{others}")
+
+    say(f"listening on {_address(listener)}; loading code (about a minute if it must be compiled)")
+    starting = asyncio.ensure_future(pool.start())
+    starting.add_done_callback(started)
+    try:
+        await server.serve([listener])
+    finally:
+        starting.cancel()
+        pool.close()
+    if starting.done() and not starting.cancelled():
+        starting.result()
+
+
+def _address(listener: socket.socket) -> str:
+    host, port = listener.getsockname()[:2]
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"

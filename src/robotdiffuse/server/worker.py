@@ -17,7 +17,7 @@ import orjson
 from robotdiffuse.core import loading
 from robotdiffuse.core.deadline import cancel_check, check_cancelled
 from robotdiffuse.core.errors import InputError, described, shown
-from robotdiffuse.core.input_files import MEGABYTE, decoded, parse_json
+from robotdiffuse.core.files import MEGABYTE, JsonObject, decoded, parse_json
 from robotdiffuse.core.settings import converted
 from robotdiffuse.core.types import RATES, Path, PlanResult, SampleRate, Trajectory, check_motion_arrays
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner
@@ -135,7 +135,8 @@ def _answer_of(endpoint: str, body: bytes) -> Answer:
     except MemoryError:
         limit_text = f"{_settings.max_worker_memory / MEGABYTE:.0f} MB"
         return failed(TOO_LARGE, f"the request needs more memory than a worker may use, {limit_text}")
-    except BaseException as error:  # the server would raise a planner's SystemExit again, in its event loop
+    # also a planner's SystemExit, which the server would raise again in its event loop
+    except BaseException as error:
         traceback.print_exc(file=sys.stderr)
         return failed(500, described(error))
 
@@ -156,8 +157,7 @@ def _memory() -> int:
 
 def failed(code: int, message: str) -> Answer:
     """An error as one line of JSON."""
-    line = " ".join(message.split())
-    return Answer(code, json.dumps({"error": line}).encode() + b"\n", "")
+    return Answer(code, json.dumps({"error": " ".join(message.split())}).encode() + b"\n", "")
 
 
 def _record(body: bytes) -> object:
@@ -192,11 +192,12 @@ def answer_plan(body: bytes) -> Answer:
     if request.seed > MAX_SEED:
         raise InputError(f"seed is {shown(request.seed)}; it must be at most {MAX_SEED}")
     planner = _planner(requested.get("planner", DEFAULT_PLANNER))
-    reading = time.monotonic() - began
+    read_time = time.monotonic() - began
+    # warm-up has its own limit; the call then has its limit minus the time that reading took
     allow(WARM_UP_TIMEOUT)
     planner.prepare(problem.robot)
     _warm_up_once(planner, problem, requested["problem"]["robot"])
-    allow(limit - reading)
+    allow(limit - read_time)
     result: PlanResult = planner.plan(problem, **call_arguments)
     record = result.record()
     if rate is not None and result.trajectory is not None:
@@ -259,7 +260,7 @@ def answer_verify(body: bytes) -> Answer:
     return _answer(record, "valid" if valid else "invalid")
 
 
-def _answer(record: dict[str, Any], status: str) -> Answer:
+def _answer(record: JsonObject, status: str) -> Answer:
     return Answer(200, orjson.dumps(record, option=orjson.OPT_APPEND_NEWLINE), status)
 
 
@@ -282,7 +283,7 @@ def read_motion(name: str, data: object) -> Path | Trajectory:
     return Trajectory(names, **checked) if name == "trajectory" else Path(names, **checked)
 
 
-def report_record(report: Report) -> dict[str, Any]:
+def report_record(report: Report) -> JsonObject:
     """A validation report as JSON values."""
     return {
         "valid": report.valid,

@@ -74,8 +74,7 @@ class WorkerPool:
     def admit(self, count: int) -> Iterator[None]:
         """Count `count` requests as admitted while the block runs. Raises RequestError if the queue is too
         full for them."""
-        capacity = self.settings.workers + self.settings.queue
-        if self.admitted + count > capacity:
+        if self.admitted + count > self.settings.workers + self.settings.queue:
             waiting = self.admitted / self.settings.workers
             seconds = str(ceil(max(1.0, waiting * self._request_seconds)))
             message = f"the queue is full; try again in {seconds} s"
@@ -106,8 +105,7 @@ class WorkerPool:
         except StoppingError:
             return failed(503, STOPPING)
         except OverrunError:
-            late = f"{GRACE_TIME:g} s beyond its time limit"
-            return failed(503, f"the request was stopped {late}, and its worker replaced")
+            return failed(503, "the request took too long: it was stopped, and its worker replaced")
         except EndedError:
             return failed(500, "the worker process died on this request, or was killed")
         except Exception as error:  # such as a reply that cannot be pickled

@@ -6,14 +6,13 @@ A step of the kind `look` moves the arm to take a view with its camera.
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int
 from numpy import ndarray
 from PIL import Image
 
-from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.core.files import JsonObject, check_output, write_atomically
 from robotdiffuse.core.transforms import placed
 from robotdiffuse.core.types import Mask, Path, Points, Trajectory
 from robotdiffuse.drawables import ASSUMED, OBSERVED, Color, Surface, drawables, painted
@@ -22,12 +21,12 @@ from robotdiffuse.perception.voxel_grid import MAP
 from robotdiffuse.planning.exploration.simulated import RecordedExplorer, RecordedStep, RecordedView
 from robotdiffuse.planning.exploration.steps import DONE, LOOK
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.visualization.arm import DrawnArm
 from robotdiffuse.visualization.picture import (
     MARGINS,
     WHITE,
     Camera,
     ClearSurface,
+    DrawnArm,
     PictureSettings,
     caption,
     faded_below,
@@ -208,8 +207,7 @@ def write_exploration_picture(explorer: RecordedExplorer, scene: Scene, file: st
     size = TILE.width, TILE.height
     camera = view_of_motion(DrawnArm(explorer.robot), drawables(scene), waypoints, size, MARGINS)
     in_scene = in_known_scene(explorer)
-    tiles = [_tile(explorer, all_moments[i], in_scene, camera) for i in chosen]
-    save_png(_joined(tiles), path)
+    save_png(_joined([_tile(explorer, all_moments[i], in_scene, camera) for i in chosen]), path)
 
 
 def _chosen(count: int) -> list[int]:
@@ -291,8 +289,9 @@ def write_exploration(explorer: RecordedExplorer, scene: Scene, file: str | File
 
 
 def _page_time(time: float, index: int) -> float:
-    """The time on the page of a `time` during the step with this index [s]. On the page, a pause comes before
-    the motion of each step."""
+    """The time on the page of a `time` during the motion of the step with this index [s]. On the page, a
+    pause comes before each motion. With the index of the step before, the beginning of a step becomes the
+    beginning of its pause."""
     return round(time + READING_TIME * (index + 1), 4)
 
 
@@ -310,7 +309,7 @@ def _whole_motion(explorer: RecordedExplorer) -> Trajectory:
     return Trajectory(explorer.robot.joint_names, np.concatenate(times), q, 0 * q, 0 * q)
 
 
-def _known(explorer: RecordedExplorer) -> list[dict[str, Any]]:
+def _known(explorer: RecordedExplorer) -> list[JsonObject]:
     """For each view and each step: the time on the page, and for each layer the faces that appear or
     disappear."""
     known_scene = in_known_scene(explorer)
@@ -339,10 +338,10 @@ def _packed(numbers: Int[ndarray, "n"]) -> str:
     return in_base64((groups + 128 * marked)[used].astype(np.uint8))
 
 
-def _step(explorer: RecordedExplorer, moment: Moment) -> dict[str, Any]:
+def _step(explorer: RecordedExplorer, moment: Moment) -> JsonObject:
     record = moment.record
-    motion = record.step.motion
-    end = motion.path.positions[-1] if record.step.kind == LOOK and motion and motion.path else None
+    moves = record.step.kind == LOOK and record.step.motion is not None
+    end = record.waypoints[-1] if moves else None
     return {
         "time": _page_time(record.begins, moment.number - 2),
         "title": f"{moment.number}  {title(moment.record)}",

@@ -1,5 +1,6 @@
 """Draws a motion as a PNG picture, in software: without GPU, window or browser. The view is chosen so that
-most of the arm and its trace are visible."""
+most of the arm and its trace are visible. HTML pages (`replay_page.py`, `live/`) use the arm's
+surfaces and the facts about a motion too."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,8 +13,9 @@ from numpy import ndarray
 from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial import ConvexHull
 
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.collision.exact_meshes import forward_frames
+from robotdiffuse.core.errors import InputError, check_type, joined
+from robotdiffuse.core.files import check_output, write_atomically
 from robotdiffuse.core.settings import Bound, Natural, NotNegative, Settings
 from robotdiffuse.core.types import (
     Configuration,
@@ -23,15 +25,123 @@ from robotdiffuse.core.types import (
     Points,
     Rotation,
     Trajectory,
+    Values,
     Vector,
+    interpolated,
 )
-from robotdiffuse.drawables import GOAL, START, Color, Drawable, Surface, drawables, join, painted
+from robotdiffuse.drawables import (
+    GOAL,
+    START,
+    Color,
+    Drawable,
+    Surface,
+    drawables,
+    join,
+    link_surfaces,
+    painted,
+)
 from robotdiffuse.perception.ray_caster import looking_at
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.moving_obstacles import MovingObstacle
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.visualization.arm import DrawnArm, dense, facts
+from robotdiffuse.robots.visual_meshes import has_visual
+from robotdiffuse.scenes.scene import MovingObstacle, Scene
 from robotdiffuse.visualization.rasterizer import blend_ghost, draw, shade
+
+UNTIMED_SPEED = 0.8
+"""Speed in joint space at which a path without times is played [rad/s]."""
+TRACE_POINTS = 240
+"""Number of configurations along a motion for drawing the tool's trace and for choosing the view."""
+
+
+class DrawnArm:
+    """The surfaces of a robot on each of its dof + 1 frames, and the point of its tool that draws the trace.
+
+    The point is on the z axis of the tip link, as far out as the surfaces on the tip's frame extend: for a
+    gripper, this is between the fingertips.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        by_frame: list[list[Surface]] = [[] for _ in range(robot.dof + 1)]
+        for link, surface in link_surfaces(robot).items():
+            by_frame[robot.link_frame(link)].append(surface.moved(robot.T_frame_link(link)))
+        self.surfaces = [join(surfaces) for surfaces in by_frame]
+        """One surface for each frame, in the coordinates of the frame [m]."""
+        self.tool_frame = robot.link_frame(robot.tip)
+        T_frame_tip = robot.T_frame_link(robot.tip)
+        heights = (self.surfaces[self.tool_frame].vertices - T_frame_tip[:3, 3]) @ T_frame_tip[:3, 2]
+        self.tool_point = T_frame_tip[:3, 3] + max(0.0, heights.max(initial=0.0)) * T_frame_tip[:3, 2]
+        """The point that draws the trace, in the coordinates of frame `tool_frame` [m]."""
+
+    def frames(self, q: Float[ndarray, "*batch dof"]) -> Float[ndarray, "*batch frames 4 4"]:
+        """T_base_frame of all dof + 1 frames at each configuration."""
+        T = forward_frames(self.robot, q.reshape(-1, self.robot.dof))
+        return T.reshape(*q.shape[:-1], *T.shape[1:])
+
+    def posed(self, q: Configuration, begin: int = 0) -> Surface:
+        """The surface of the arm at a configuration, in the base frame. Only frames from `begin` on are
+        included: 1 leaves out the base."""
+        poses = zip(self.surfaces[begin:], self.frames(q)[begin:], strict=True)
+        return join([surface.moved(T) for surface, T in poses])
+
+    def tool_points(self, q: Configurations) -> Points:
+        """Positions of the tool point in the base frame [m]."""
+        return self.frames(q)[:, self.tool_frame, :3] @ np.append(self.tool_point, 1.0)
+
+    def trace(self, q: Configurations) -> Points:
+        """Positions of the tool point at TRACE_POINTS configurations, equally spaced along a path in joint
+        space [m]."""
+        return self.tool_points(dense(q))
+
+
+def dense(q: Configurations) -> Configurations:
+    """TRACE_POINTS configurations, equally spaced along a path in joint space; one configuration if the path
+    has no length."""
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(q, axis=0), axis=1))])
+    return q[:1] if s[-1] == 0 else interpolated(np.linspace(0, s[-1], TRACE_POINTS), s, q)
+
+
+def timed(motion: Path | Trajectory) -> tuple[Values, Configurations]:
+    """Times [s] and positions of a motion; a path without times gets a constant speed in joint space."""
+    if isinstance(motion, Trajectory):
+        return motion.times, motion.positions
+    steps = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1) / UNTIMED_SPEED
+    return np.concatenate([[0.0], np.cumsum(steps)]), motion.positions
+
+
+def check_motion_of(robot: Robot, motion: Path | Trajectory) -> None:
+    """Raises InputError for a motion of other joints, or with numbers that are not finite."""
+    check_type("motion", motion, (Path, Trajectory), "a Path or a Trajectory")
+    if tuple(motion.joint_names) != robot.joint_names:
+        names = joined(motion.joint_names)
+        raise InputError(f"the motion moves {names}; {robot.name} plans {joined(robot.joint_names)}")
+    if not np.isfinite(motion.positions).all():
+        raise InputError("the motion has positions that are not finite")
+
+
+def facts(
+    motion: Path | Trajectory, result: PlanResult | None, robot: Robot | None = None
+) -> list[tuple[str, str]]:
+    """Labels and values of facts about a motion, for headers and captions. With `robot`, one of them says
+    that the arm is drawn by its collision geometry, if no visual meshes of this robot are bundled."""
+    length = result.path_length if result is not None else None
+    if length is None:
+        length = Path(motion.joint_names, motion.positions).length
+    rows = []
+    if result is not None:
+        rows.append(("status", result.status.value.replace("_", " ")))
+        same_planner = result.stage in ("", result.planner)
+        rows.append(("planner", result.planner if same_planner else f"{result.planner} · {result.stage}"))
+        rows.append(("planning time", f"{1e3 * result.planning_time:.0f} ms"))
+    rows.append(("path length", f"{length:.2f} rad"))
+    if result is not None and result.min_clearance is not None:
+        rows.append(("clearance", f"{result.min_clearance * 1e3:.1f} mm"))
+    if result is not None and result.confidence is not None:
+        rows.append(("free in unknown space", f"{100 * result.confidence:.0f} %"))
+    rows.append(("duration", f"{motion.duration:.2f} s" if isinstance(motion, Trajectory) else "untimed"))
+    if robot is not None and not has_visual(robot):
+        rows.append(("drawn by", "collision geometry"))
+    return rows
+
 
 AZIMUTHS = 18
 """Number of azimuths of candidate views."""
@@ -65,7 +175,7 @@ class Camera:
         return looking_at(self.eye, self.target)[:3, :3].T
 
     def project(self, points: Points) -> Points:
-        """Pixel x and y, and 1 / depth (0 behind the camera)."""
+        """Pixel x and y, and 1 / depth (0 if the depth is at most 5 cm, as behind the camera)."""
         x, y, z = ((points - self.eye) @ self.rotation.T).T
         near = np.where(z > 0.05, 1 / np.maximum(z, 0.05), 0.0)
         columns = [0.5 * self.width + self.focal * x * near, 0.5 * self.height + self.focal * y * near, near]
@@ -79,9 +189,7 @@ class Camera:
         return self.rotation.T @ pixel
 
 
-def drawn_by(
-    camera: Camera, surface: Surface
-) -> tuple[Float[ndarray, "h w"], Int[ndarray, "h w"], Float[ndarray, "v 3"]]:
+def drawn_by(camera: Camera, surface: Surface) -> tuple[Float[ndarray, "h w"], Int[ndarray, "h w"], Points]:
     """Nearness and index of the visible face at each pixel, and the vertices on the screen; see
     `rasterizer.draw`."""
     near = np.zeros((camera.height, camera.width), np.float32)
@@ -109,6 +217,7 @@ def framed(
     """
     target = 0.5 * (points.min(0) + points.max(0))
     distance = 1.0
+    # borders of the part of the picture that is not left free, as coordinates at depth 1
     tangent = np.tan(VERTICAL_FIELD / 2)
     top = -(1 - 2 * free[0]) * tangent
     bottom = (1 - 2 * free[1]) * tangent
@@ -132,8 +241,8 @@ def view_of_motion(
     free: tuple[float, float],
     azimuth: float | None = None,
 ) -> Camera:
-    """The framed view that shows most of the arm, of its trace along a motion and of the obstacles, among
-    AZIMUTHS x ELEVATIONS.
+    """Of the views from AZIMUTHS x ELEVATIONS, the framed one that shows most of the arm, of its trace along
+    a motion and of the obstacles.
 
     `among` are the obstacles. `azimuth` fixes the azimuth, measured from the x axis of the base [rad]; None:
     the best one is chosen.
@@ -148,6 +257,7 @@ def view_of_motion(
     middle = 0.5 * (moving.min(0) + moving.max(0))
     near = np.linalg.norm(obstacles.vertices - middle, axis=1) < MAX_FRAMING_DISTANCE
     points = np.concatenate([moving, obstacles.vertices[near]])
+    # the corners of the convex hull determine the frame
     points = points[ConvexHull(points, qhull_options="QJ").vertices]
     thumbnail_size = (160, max(1, 160 * size[1] // size[0]))
     around = np.arange(AZIMUTHS) * (2 * np.pi / AZIMUTHS) if azimuth is None else np.array([azimuth])
@@ -205,7 +315,7 @@ def _score(
 
 SUPERSAMPLING = 2
 """Number of rendered pixels per pixel along each side."""
-# numbers of directional lights for the sky and for the main light, and the edge lengths of their shadow maps
+# for the sky and for the main light: number of directional lights, and edge length of their shadow maps
 # [pixels]
 SKY_LIGHTS = 60
 SKY_MAP = 320
@@ -253,8 +363,8 @@ class PictureSettings(Settings, name="picture"):
     width: Pixels = 1280
     height: Pixels = 800
     ghosts: Natural = 5
-    """Number of see-through arms from the start towards the goal."""
-    azimuth: float | None = None
+    """Number of see-through arms from the start towards the goal, and of later poses of moving obstacles."""
+    azimuth: Annotated[float, Bound()] | None = None
     """Azimuth of the camera, measured from the x axis of the base [rad]; None: where most of the motion is
     visible."""
     shell: NotNegative = 0.0
@@ -304,6 +414,7 @@ def write_comparison(
         raise InputError(f"{len(motions)} motions; a picture shows 1 to {len(COMPARED)}")
     first, *other_motions = motions.values()
     pixels = render(robot, scene, first, settings or PictureSettings(), others=other_motions, moving=moving)
+    # without labels, "untimed" (see `facts`) would say nothing
     figures = [", ".join(v for k, v in facts(m, None) if v != "untimed") for m in motions.values()]
     captions = list(zip(motions, figures, strict=True))
     write_captioned(pixels, path, title or robot.name, captions, COMPARED)
@@ -345,7 +456,8 @@ def render(
         scene: Its static obstacles.
         motion: The motion along which the arm is drawn.
         settings: Size and contents of the picture.
-        camera: The camera; None: a view that shows most of the motion is chosen.
+        camera: The camera; its size is ignored, that of `settings` counts. None: a view that shows most of
+            the motion is chosen.
         others: Further motions for which only traces are drawn; all traces then have the colors COMPARED.
         added: Further solid surfaces in the base frame.
         clear: Further see-through surfaces in the base frame.
@@ -353,7 +465,12 @@ def render(
 
     Returns:
         The picture, uint8 [height, width, 3].
+
+    Raises:
+        InputError: For motions of other joints, or with numbers that are not finite.
     """
+    for item in (motion, *others):
+        check_motion_of(robot, item)
     arm = DrawnArm(robot)
     obstacles = drawables(scene, moving)
     q = dense(motion.positions)
@@ -409,7 +526,7 @@ def _paint(camera: Camera, solid: Surface, clear: Sequence[ClearSurface]) -> Flo
     near, ident, screen = drawn_by(camera, solid)
     image = np.zeros((*near.shape, 3), np.float32)
     view = (camera.eye, camera.rays())
-    height = min(0.0, float(solid.vertices[:, 2].min(initial=0.0)))
+    height = float(solid.vertices[:, 2].min(initial=0.0))
     toward = _key_direction(camera)
     sky = _light_maps(solid, _cone(np.array([0.0, 0.0, 1.0]), np.pi / 2, SKY_LIGHTS), SKY_MAP)
     key = _light_maps(solid, _cone(toward, KEY_SPREAD, KEY_LIGHTS), KEY_MAP)

@@ -19,7 +19,7 @@ import numpy as np
 from PIL import Image
 
 from robotdiffuse.core.errors import InputError, check_type, shortened
-from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.core.files import JsonObject, check_output, write_atomically
 from robotdiffuse.core.transforms import IDENTITY, inverse, moved_spheres, quaternion_from_rotation
 from robotdiffuse.core.types import (
     Configuration,
@@ -56,17 +56,19 @@ from robotdiffuse.problems.problem import (
     poses_of,
 )
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.moving_obstacles import MovingObstacle
-from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene import MovingObstacle, Scene, added
 from robotdiffuse.scenes.shapes import PointCloud, Sphere, Triangulated
-from robotdiffuse.visualization.arm import DrawnArm, facts, timed
 from robotdiffuse.visualization.picture import (
     MARGINS,
     VERTICAL_FIELD,
     ClearSurface,
+    DrawnArm,
     PictureSettings,
+    check_motion_of,
+    facts,
     linear,
     render,
+    timed,
     tube,
     view_of_motion,
     write_captioned,
@@ -103,11 +105,10 @@ def write_replay(
     target = check_output(file, (".html", ".htm"))
     count = len(scene.shapes) + len(moving)
     title = title or f"{robot.name} · {count} obstacle{'' if count == 1 else 's'}"
-    data = page_data(robot, scene, motion, result, moving)
-    write_atomically(target, page_text(title, data))
+    write_atomically(target, page_text(title, page_data(robot, scene, motion, result, moving)))
 
 
-def page_text(title: str, data: dict[str, Any], script: str = "") -> str:
+def page_text(title: str, data: JsonObject, script: str = "") -> str:
     """The HTML text of a page with the data of `page_data`. `script` is the name of a file in the folder
     `page` that runs after `replay.js`."""
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
@@ -122,6 +123,11 @@ def page_text(title: str, data: dict[str, Any], script: str = "") -> str:
         "more": (page / script).read_text("utf-8") if script else "",
     }
     template = (page / "replay.html").read_text("utf-8")
+    return _filled(template, parts)
+
+
+def _filled(template: str, parts: dict[str, str]) -> str:
+    """The template with each {{name}} replaced by the part of that name, in one pass."""
     return re.sub(r"\{\{(\w+)\}\}", lambda part: parts[part[1]], template)
 
 
@@ -131,8 +137,9 @@ def page_data(
     motion: Path | Trajectory,
     result: PlanResult | None = None,
     moving: Sequence[MovingObstacle] = (),
-) -> dict[str, Any]:
+) -> JsonObject:
     """The data of a page, in the form that `replay.js` reads; for the arguments see `write_replay`."""
+    check_motion_of(robot, motion)
     arm = DrawnArm(robot)
     obstacles = drawables(scene, moving)
     times, positions = _thinned(*timed(motion))
@@ -206,19 +213,19 @@ def _spheres(robot: Robot) -> list[list[float | int]]:
     return rows
 
 
-def page_shapes(scene: Scene) -> list[dict[str, Any]]:
+def page_shapes(scene: Scene) -> list[JsonObject]:
     """The obstacles of a scene, in the form that the page reads."""
     return [_shape(obstacle) for obstacle in drawables(scene)]
 
 
-def _shape(obstacle: Drawable) -> dict[str, Any]:
+def _shape(obstacle: Drawable) -> JsonObject:
     """An obstacle in the form that the page reads: its fields, or packed geometry for meshes and point
     clouds."""
     shape = obstacle.shape
     color = obstacle.color
     if isinstance(shape, Triangulated):
         return page_surface(shape.name, obstacle.surface, color)
-    record: dict[str, Any] = {"kind": shape.kind, "name": shape.name, "color": color}
+    record: JsonObject = {"kind": shape.kind, "name": shape.name, "color": color}
     if isinstance(shape, PointCloud):
         low, step, points = _quantized(thinned(shape.points))
         return record | {"radius": shape.point_radius, "low": low, "step": step, "points": points}
@@ -228,12 +235,12 @@ def _shape(obstacle: Drawable) -> dict[str, Any]:
     return record
 
 
-def page_surface(name: str, surface: Surface, color: Color) -> dict[str, Any]:
+def page_surface(name: str, surface: Surface, color: Color) -> JsonObject:
     """A surface in the base frame with one color, in the form that the page reads."""
     return {"kind": "mesh", "name": name, "color": color, "surface": _packed(surface, colored=False)}
 
 
-def _packed(surface: Surface, colored: bool = True) -> dict[str, Any]:
+def _packed(surface: Surface, colored: bool = True) -> JsonObject:
     """A surface as base64 texts: 16-bit vertices, 8-bit normals and colors, and faces."""
     low, step, vertices = _quantized(surface.vertices)
     wide_indices = len(surface.vertices) >= 2**16
@@ -295,13 +302,13 @@ def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | N
     goal_configuration, validity = _goal_state(problem)
     validities = {"start": problem.is_free(problem.start), "goal": validity}
     states = np.stack([problem.start] if goal_configuration is None else [problem.start, goal_configuration])
-    scene = problem.scene.with_shapes([*problem.scene.shapes, *(moving.shape for moving in problem.moving)])
+    scene = added(problem.scene, (moving.shape for moving in problem.moving))
     robot, scene = replace(problem, scene=scene, moving=()).robot_and_scene_in_world()
     T_world_base = IDENTITY if problem.T_world_base is None else problem.T_world_base
     poses = (pose for goal in goals_of(problem.goal) for pose in poses_of(goal))
     T_world_poses = [T_world_base @ pose.T_base_frame for pose in poses]
     near_poses = [Sphere(T[:3, 3], AXIS_LENGTH) for T in T_world_poses]
-    framed = scene.with_shapes([*scene.shapes, *near_poses])  # the view includes goal poses
+    framed = added(scene, near_poses)  # the view includes goal poses
     arm = DrawnArm(robot)
     marks = [*_colliding_links(arm, states, list(validities.values())), *_axes(T_world_poses)]
     facts = [(label, state.reason or "free") for label, state in validities.items()]
@@ -346,7 +353,7 @@ def _colliding_links(
 ) -> list[tuple[Surface, Color]]:
     """The surfaces of the colliding links at each of the configurations `states`, and their color."""
     robot = arm.robot
-    links = link_surfaces(arm.robot)
+    links = link_surfaces(robot) if any(validity.links for validity in validities) else {}
     marks = []
     # not strict: if no configuration reaches the goal, `states` has only the start
     for q, validity in zip(states, validities, strict=False):
@@ -474,8 +481,8 @@ def write_gallery(
             progress(i + 1, len(entries))
     # in JSON '<' occurs only in strings; escaped, it cannot end the script element
     data = json.dumps(_shared(replays)).replace("<", "\\u003c")
-    page = PAGE.replace("{{title}}", html.escape(title)).replace("{{buttons}}", "".join(buttons))
-    write_atomically(target, page.replace("{{replays}}", data))
+    parts = {"title": html.escape(title), "buttons": "".join(buttons), "replays": data}
+    write_atomically(target, _filled(PAGE, parts))
 
 
 def _shared(pages: list[str]) -> dict[str, list]:
@@ -528,7 +535,8 @@ def show(result: PlanResult | ResultFile, problem: Problem | None = None, height
         The replay, which notebooks display.
 
     Raises:
-        InputError: Outside a notebook, and if the problem is unknown.
+        InputError: Outside a notebook, for a result or problem of another type, and if the problem is
+            unknown or cannot be read.
 
     Example:
         ```python

@@ -424,8 +424,7 @@ def _head(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
 
     token = ("", "abc")[rng.integers(2)]
     host = (b"localhost:8080", b"[::1]:1", b"a.example")[rng.integers(3)]
-    fields = (b"/abc/?x=1", host, b"http://" + host)
-    path, host, origin = (damaged(rng, field).decode("latin-1") for field in fields)
+    path, host, origin = (damaged(rng, field).decode("latin-1") for field in (b"/abc/?x=1", host, b"http://" + host))
     return lambda: may_connect(path, host, origin, token)
 
 

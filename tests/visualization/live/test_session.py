@@ -184,12 +184,7 @@ def test_a_planner_that_breaks_costs_one_plan(monkeypatch: pytest.MonkeyPatch) -
 
 def test_latest_goes_on_after_an_error(caplog: pytest.LogCaptureFixture) -> None:
     done = threading.Event()
-
-    def do(divisor: int) -> None:
-        if 1 / divisor:
-            done.set()
-
-    latest = live.LatestTask(do, "test")
+    latest = live.LatestTask[int](lambda divisor: done.set() if 1 / divisor else None, "test")
     latest.submit(0)
     until(lambda: "ZeroDivisionError" in caplog.text)
     latest.submit(1)
@@ -205,6 +200,7 @@ CORNERS = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
     [
         *(live.NEW_OBSTACLES[kind](np.array([0.1, 0.2, 0.3]), 0.08) for kind in ("sphere", "box", "cylinder", "capsule")),
         rd.Mesh(CORNERS, [[0, 1, 2], [0, 1, 3]], xyz=(0.1, 0, 0)),
+        rd.HeightMap(np.eye(3), 0.1, wxyz=(0.6, 0, 0, 0.8)),
         rd.PointCloud(CORNERS),
     ],
     ids=lambda shape: shape.kind,

@@ -36,7 +36,6 @@ from robotdiffuse.planning.exploration.steps import (
     ExplorerSettings,
 )
 from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.visualization.arm import DrawnArm
 from robotdiffuse.visualization.exploration import (
     LOOK_COLOR,
     READING_TIME,
@@ -71,6 +70,7 @@ from robotdiffuse.visualization.live.session import (
     LatestTask,
     Validity,
 )
+from robotdiffuse.visualization.picture import DrawnArm
 
 # phases: paused before a step, choosing a step, executing it, and after the last step
 WAITING = "waiting"
@@ -205,10 +205,9 @@ class ExplorationSession:
             self._execute(run, explorer)
             ended = event.step.motion is None or not event.free
             with self._changed:
-                mode = PAUSED if self.state.mode == STEPPING else self.state.mode
                 self._update(
                     run,
-                    mode=mode,
+                    mode=PAUSED if self.state.mode == STEPPING else self.state.mode,
                     phase=ENDED if ended else CHOOSING,
                     violation=event.violation,
                     known=explorer.views[-1],
@@ -233,8 +232,7 @@ class ExplorationSession:
             last = now
             if at > 0:
                 taken_views = [view for view in moment.views if view.time <= record.begins + at]
-                q = record.trajectory.at(at).positions
-                self._update(run, configuration=q, known=taken_views[-1])
+                self._update(run, configuration=record.trajectory.at(at).positions, known=taken_views[-1])
 
     def _update(self, run: int, **changes: Any) -> ExplorationState:
         with self._changed:

@@ -24,7 +24,7 @@ from robotdiffuse.planning import PLANNERS
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
-from robotdiffuse.visualization.arm import DrawnArm
+from robotdiffuse.validation.validator import verify_trajectory
 from robotdiffuse.visualization.live.server import PageServer
 from robotdiffuse.visualization.live.session import (
     COLLISIONS,
@@ -49,6 +49,7 @@ from robotdiffuse.visualization.live.session import (
     uploaded_problem,
     validity,
 )
+from robotdiffuse.visualization.picture import DrawnArm
 from robotdiffuse.visualization.replay_page import result_page
 
 # sizes of gizmos (transform controls), as fractions of the arm's reach
@@ -150,7 +151,8 @@ class Page(LivePage):
         violation = None if state.validation is None else state.validation.report.violation
         if new("robot", robot):
             self._new_robot(robot)
-        self._drawn.frames(problem.start)  # compiles, which would delay the messages of the atomic block
+        # the first call compiles, which would delay the messages in the atomic block
+        self._drawn.frames(problem.start)
         with self.server.atomic():
             self._panel.show(state, validity(state), selected)
             if new("scene", problem.scene, selected):
@@ -166,7 +168,7 @@ class Page(LivePage):
             if new("goal", state.goal_configuration):
                 self._arms["goal"].show(state.goal_configuration)
             self.goal_gizmo.show(state.goal_pose)
-            if new("motion", state.motion):
+            if new("motion", problem.start if state.motion is None else state.motion):
                 self._new_motion(state)
             if new("validation", state.validation):
                 contact = None
@@ -175,10 +177,13 @@ class Page(LivePage):
                 self._arms["contact"].show(contact)
             answer = state.answer
             tree_answer = answer if state.options.trees else None
+            # until there is an answer, the trees of the last one stay visible
             if (answer is not None or not state.options.trees) and new("trees", tree_answer):
                 draw_trees(self.server, self._drawn, () if tree_answer is None else tree_answer.trees)
 
     def _new_robot(self, robot: Robot) -> None:
+        with self._lock:
+            self._frames = None  # of the old robot; the player must not show them on the new arm
         for arm in self._arms.values():
             arm.root.remove()
         self._drawn = DrawnArm(robot)
@@ -214,10 +219,11 @@ class Page(LivePage):
 
     def _show_time(self, at: float) -> None:
         with self._lock:
-            if self._frames is None or "arm" not in self._arms:
+            if self._frames is None:
                 return
-            row = min(round(at * POSE_RATE), len(self._frames) - 1)
-            self._arms["arm"].show_frames(self._frames[row])
+            last = len(self._frames) - 1
+            number = last if at >= self.player.duration else min(round(at * POSE_RATE), last)
+            self._arms["arm"].show_frames(self._frames[number])
         self._show_moving(at)
         self._panel.show_time(at, self.player.duration)
 
@@ -318,7 +324,7 @@ class Panel:
         session = self._session
         options = self._session.state.options
         planners = ", ".join(TREE_PLANNERS)
-        trees = f"Search trees from the start (blue) and the goal (green), of {planners}"
+        trees = f"Search trees from the start (blue) and the goal (green); only {planners} have them"
         boxes = (
             ("follow", "Plan automatically", "Plan again after each change"),
             ("trees", "Search trees", trees),
@@ -381,7 +387,11 @@ class Panel:
         state = self._session.state
         if state.motion is None:
             raise InputError("there is no motion to save yet")
-        return result_page(state.problem, state.motion).encode()
+        # the problem may have changed since the motion was planned
+        report = verify_trajectory(state.problem, state.motion.trajectory)
+        if report.violation is not None:
+            raise InputError(f"the motion is not valid any more: {report.violation.message}")
+        return result_page(state.problem, replace(state.motion, min_clearance=report.min_clearance)).encode()
 
     # display
 
@@ -424,9 +434,12 @@ class Panel:
             set_value(self._sizes[size_name], value)
 
     def _size_slider(self, name: str, dimension: str, value: float) -> Any:
-        max_size = max(MAX_DIMENSION, value)
         slider = self._server.gui.add_slider(
-            dimension, min=min(MIN_DIMENSION, value), max=max_size, step=0.005, initial_value=value
+            dimension,
+            min=min(MIN_DIMENSION, value),
+            max=max(MAX_DIMENSION, value),
+            step=0.005,
+            initial_value=value,
         )
         resize = self._session.change_obstacle
         self._on(
@@ -472,6 +485,9 @@ class Panel:
         robot = state.problem.robot
         motion = state.motion
         if motion is None or motion.trajectory is None:
+            if self._plot is not None:
+                self._plot.remove()
+                self._plot = None
             return
         data = plotted(robot, motion.trajectory, self._kind.value)
         names = robot.joint_names
@@ -600,8 +616,7 @@ class Arm:
             self._frames.append(server.scene.add_frame(f"/{name}/{i}", show_axes=False))
             if len(surface.faces) == 0 or (i == 0 and color is not None):
                 continue
-            parts = surface.by_color if color is None else [(color, surface)]
-            for k, (part_color, part) in enumerate(parts):
+            for k, (part_color, part) in enumerate(surface.by_color if color is None else [(color, surface)]):
                 if opacity is not None:
                     vertices = part.vertices + opacity / GHOST_OPACITY * GHOST_OFFSET * part.normals
                     part = replace(part, vertices=vertices)

@@ -19,8 +19,7 @@ from robotdiffuse.core.network import is_loopback, listening, named_host, url_pa
 from robotdiffuse.core.types import Configurations
 from robotdiffuse.drawables import drawables
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.visualization.arm import DrawnArm
-from robotdiffuse.visualization.picture import VERTICAL_FIELD, view_of_motion
+from robotdiffuse.visualization.picture import VERTICAL_FIELD, DrawnArm, view_of_motion
 
 FLOOR_SIZE = 4.7
 """Edge length of the floor, as a multiple of the arm's reach."""

@@ -19,7 +19,7 @@ import numpy as np
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP
 from robotdiffuse.core.errors import InputError, check_name, described, unknown_name
-from robotdiffuse.core.input_files import decoded, parse_json, parse_yaml
+from robotdiffuse.core.files import decoded, parse_json, parse_yaml
 from robotdiffuse.core.settings import Bound, OneOf, Settings
 from robotdiffuse.core.transforms import inverse, transform
 from robotdiffuse.core.types import Configuration, PlanResult, Pose, Vector
@@ -33,7 +33,7 @@ from robotdiffuse.robots import known_robots, load_robot
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere, Triangulated
 from robotdiffuse.validation.report import Report
 from robotdiffuse.validation.validator import verify_trajectory
 
@@ -49,7 +49,7 @@ size [m]."""
 MIN_DIMENSION = 0.01
 MAX_DIMENSION = 2.0
 AXES = ("x", "y", "z")
-ORIENTED = (Box, Cylinder, Capsule, Mesh)
+ORIENTED = (Box, Cylinder, Capsule, Triangulated)
 """Shapes that can be rotated by dragging. Rotating a sphere has no effect, and point clouds store no pose."""
 # position of new obstacles, and radius of a new sphere, as fractions of the arm's reach
 NEW_POSITION = np.array([0.5, 0.0, 0.5])
@@ -65,7 +65,7 @@ FAMILY = "shelf"
 MAX_UPLOAD_SIZE = 5_000_000
 """Largest size of an uploaded problem file [bytes]."""
 MAX_SAMPLES = 1000
-"""Largest number of random configurations that are tried for a free start and goal."""
+"""Number of random configurations among which a free start and goal are looked for."""
 # kinds of badges: valid motion, invalid motion, no motion, not validated yet
 VALID = "valid"
 INVALID = "invalid"
@@ -106,7 +106,7 @@ class State:
     problem: Problem
     options: PageOptions = PageOptions()
     version: int = 0
-    """Number of changes of the problem and the options so far."""
+    """Number of changes so far of the problem and of the options other than `trees`."""
     planning: bool = False
     """Whether a plan for this version is being computed."""
     answer: PlanResult | None = None
@@ -149,7 +149,7 @@ class Session:
         self._start_task = LatestTask(self._move_start, "start")
 
     def start(self) -> None:
-        """Plan for the first time."""
+        """Find a configuration at the goal, and plan for the first time if `follow` is on."""
         self._goal_task.submit(self.state.goal_pose)
         self._changed()
 
@@ -196,8 +196,7 @@ class Session:
         with self._lock:
             state = self.state
             goal = _posed(state.problem.goal, state.goal_frame, T_base_frame)
-            problem = replace(state.problem, goal=goal)
-            self._set(problem=problem, goal_pose=T_base_frame)
+            self._set(problem=replace(state.problem, goal=goal), goal_pose=T_base_frame)
             self._goal_task.submit(T_base_frame)
             self._changed()
 
@@ -213,7 +212,7 @@ class Session:
         self._start_task.submit(T_base_tip)
 
     def add_obstacle(self, kind: str) -> str:
-        """Add an obstacle in front of the arm, at half the arm's reach, and return its name."""
+        """Add an obstacle half the arm's reach in front of the base and as far above it; return its name."""
         with self._lock:
             check_name("kind of obstacle", kind, NEW_OBSTACLES)
             length = self.state.problem.robot.reach
@@ -232,8 +231,7 @@ class Session:
 
     def _set_scene(self, shapes: list[Shape]) -> None:
         problem = self.state.problem
-        scene = problem.scene.with_shapes(shapes)
-        self._set(problem=replace(problem, scene=scene))
+        self._set(problem=replace(problem, scene=problem.scene.with_shapes(shapes)))
         self._changed()
 
     def _changed(self) -> None:
@@ -283,8 +281,9 @@ class Session:
     def _move_start(self, T_base_tip: Pose) -> None:
         problem = self.state.problem
         q = _configuration_at(problem.robot, problem.robot.tip, T_base_tip, problem.start)
-        if q is not None and self.state.problem.robot is problem.robot:
-            self.set_start(q)
+        with self._lock:  # `open` may change the robot meanwhile
+            if q is not None and self.state.problem.robot is problem.robot:
+                self.set_start(q)
 
     def _plan(self, version: int) -> None:
         state = self.state
@@ -341,9 +340,8 @@ class Session:
 def _configuration_at(
     robot: Robot, link: str, T_base_link: Pose, near: Configuration
 ) -> Configuration | None:
-    rng = np.random.default_rng(0)
     solutions = inverse_kinematics(
-        robot, link, T_base_link, 1, rng=rng, settings=QUICK_IK, near=near, rest=near
+        robot, link, T_base_link, 1, rng=np.random.default_rng(0), settings=QUICK_IK, near=near, rest=near
     )
     return solutions[0] if len(solutions) else None
 
@@ -448,7 +446,8 @@ def validity(state: State) -> Validity:
         to_obstacles = f"to obstacles {_distance(report.scene_clearance)}" if obstacles else "no obstacles"
         between = f"between links {_distance(report.self_clearance)}"
         lines = (f"{to_obstacles}, {between}, over {trajectory.duration:.2f} s", *more)
-        return Validity(VALID, f"free, clearance at least {_distance(report.min_clearance)}", lines)
+        clearance = _distance(report.min_clearance).removeprefix("more than ")
+        return Validity(VALID, f"free, clearance at least {clearance}", lines)
     title = "collides" if violation.kind in COLLISIONS else "not valid"
     when = f"at {violation.time:.2f} s of {trajectory.duration:.2f} s"
     return Validity(INVALID, f"{title}: {violation.message}", (when, *more))
@@ -478,7 +477,7 @@ def first_problem(file: str | None, robot: str | None) -> Problem:
 
 def problem_for(robot: Robot) -> Problem:
     """A problem of the family shelf for the robot. If the family cannot be drawn for it, the problem is
-    between two free configurations in an empty scene."""
+    between two free configurations in an empty scene. Raises InputError if fewer than two are found."""
     rng = np.random.default_rng(0)
     try:
         return load_family(FAMILY).draw(robot, rng).problem(robot)
