@@ -232,7 +232,7 @@ def test_views_older_than_max_age_count_no_more() -> None:
     new, old = (explorer(seen=seen, max_age=1.0) for seen in (False, True))
     for arm in (new, old):
         arm.observe(replace(view(), depth=np.zeros_like(view().depth)), 2.0)
-    assert np.array_equal(*(np.array(arm.predicted(), float) for arm in (new, old)))
+    assert np.array_equal(np.array(new.predicted(), float), np.array(old.predicted(), float))
 
 
 def seen_from(position: tuple[float, float, float], *shapes: rd.Box) -> rd.DepthView:
