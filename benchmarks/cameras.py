@@ -22,7 +22,7 @@ Records are kept in FILE and not made again; --report prints their tables.
 --weights adds the method 'predicted' with other weights of the occupancy completion network, folders of
 `train completion`; such methods are named by the folder. Weights that were trained without some families are
 tried on these families. --fit prints the constants RATES, from problems with even numbers, and ONE_VIEW, from
-all problems, of perception/unknown_space.py. Settings were also chosen on problems with even numbers; --odd
+all problems, of perception/occupancy_map.py. Settings were also chosen on problems with even numbers; --odd
 leaves these out of the report.
 --times prints the CPU time of the network.
 
@@ -48,9 +48,9 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from common import FIRST, TIME_LIMIT, header, parse, print_table, progress, use_processor_time
-from robotdiffuse.core.output_files import JsonLines
+from robotdiffuse.core.files import JsonLines
 from robotdiffuse.core.types import PlanResult, Values
-from robotdiffuse.evaluation.statistics import compare, wilson_interval
+from robotdiffuse.evaluation.bench_comparisons import compare, wilson_interval
 from robotdiffuse.learning.completion import (
     CameraPlaces,
     Completion,
@@ -60,16 +60,15 @@ from robotdiffuse.learning.completion import (
 )
 from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 from robotdiffuse.perception.observed_volume import observe
+from robotdiffuse.perception.occupancy_map import MIN_RISK
 from robotdiffuse.perception.ray_caster import MAX_RANGE, ray_cast, voxels_within
-from robotdiffuse.perception.unknown_space import MIN_RISK
 from robotdiffuse.perception.voxel_grid import FINE
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.exploration.viewpoints import next_view, poses_around
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.problems.families import FAMILIES
-from robotdiffuse.problems.files import load_problems
-from robotdiffuse.problems.held_out import SEED, held_out_problem, line_length
+from robotdiffuse.problems.files import SEED, held_out_problem, line_length, load_problems
 from robotdiffuse.problems.problem import PREDICTED, Problem
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
@@ -417,7 +416,7 @@ def times(families: list[str], calls: int = TIMED_CALLS) -> None:
 
 
 def fit(rows: list[Row]) -> None:
-    """Print the constants RATES and ONE_VIEW of perception/unknown_space.py."""
+    """Print the constants RATES and ONE_VIEW of perception/occupancy_map.py."""
     rows = [row for row in rows if row["solved"] and row["views"] == 1]
     predicted = [row for row in rows if row["method"] == PREDICTED]
     log_risk = np.log(np.maximum([row["risk"] for row in predicted], MIN_RISK))

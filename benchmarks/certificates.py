@@ -32,8 +32,7 @@ from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.core.types import PlanResult, Status
-from robotdiffuse.problems.files import problem_record
-from robotdiffuse.problems.held_out import held_out_problem
+from robotdiffuse.problems.files import held_out_problem, problem_record
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.validation.report import Report
 from robotdiffuse.validation.validator import VerifySettings, verify, verify_trajectory

@@ -207,7 +207,7 @@ def count_row(title: str, counts: Int[ndarray, "4"]) -> list[str]:
 @njit
 def place_along(space, starts, ends, counts):
     """Computes the forward kinematics of a check of edges. counts: number of configurations of each edge."""
-    work = make_workspace(space.robot, space.scene)
+    work = make_workspace(space.robot)
     block = lanes_array(starts.shape[1], 1)
     for i in range(len(starts)):
         for j in range(starts.shape[1]):

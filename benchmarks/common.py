@@ -20,9 +20,9 @@ from rich.progress import track
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.tables import Column, Rows, Table, show
 from robotdiffuse.core.types import UNTIL, Trajectory
-from robotdiffuse.evaluation.problem_sets import hard_cases
 from robotdiffuse.evaluation.report import processor, versions
-from robotdiffuse.problems.held_out import Case
+from robotdiffuse.evaluation.runs import hard_cases
+from robotdiffuse.problems.files import Case
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.simulation.validator import PyBulletOracle

@@ -51,7 +51,7 @@ from robotdiffuse.core.types import Path
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems import constraint_kernel as kernel
 from robotdiffuse.problems.compiled_constraints import PathConstraints
-from robotdiffuse.problems.held_out import SEED, held_out_problem
+from robotdiffuse.problems.files import SEED, held_out_problem
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.problems.projection_kernel import project
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics

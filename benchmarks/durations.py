@@ -31,12 +31,12 @@ from common import (
     progress,
     use_processor_time,
 )
-from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.files import write_atomically
 from robotdiffuse.core.types import LENGTH, TIME, PlanResult, Trajectory
-from robotdiffuse.evaluation.problem_sets import gather_cases
+from robotdiffuse.evaluation.runs import gather_cases
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.planner import Planner
-from robotdiffuse.problems.held_out import Case
+from robotdiffuse.problems.files import Case
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.trajectories.straight_line import straight_line_time
 

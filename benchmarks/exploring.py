@@ -52,10 +52,10 @@ from cameras import (
 from common import header, parse, print_table, progress, use_processor_time
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.core.output_files import JsonLines
+from robotdiffuse.core.files import JsonLines
 from robotdiffuse.core.types import FIRST
 from robotdiffuse.core.types import Path as JointPath
-from robotdiffuse.evaluation.statistics import wilson_interval
+from robotdiffuse.evaluation.bench_comparisons import wilson_interval
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.occupancy_map import Corners
 from robotdiffuse.perception.ray_caster import voxels_within

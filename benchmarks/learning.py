@@ -32,6 +32,7 @@ from robotdiffuse.baselines.controls import ControlSettings
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core import tables
 from robotdiffuse.core.tables import Cell, Column, Table, show
+from robotdiffuse.evaluation.bench_comparisons import bootstrap_interval, wilson_interval
 from robotdiffuse.evaluation.runs import (
     NETWORK_ALONE,
     Clock,
@@ -43,11 +44,10 @@ from robotdiffuse.evaluation.runs import (
     run_all,
     sampled,
 )
-from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
 from robotdiffuse.learning.motion_model import MAX_CLEARANCE, ClearanceFn, MotionModel
 from robotdiffuse.planning.diffusion import Diffusion
 from robotdiffuse.problems.families import FAMILIES
-from robotdiffuse.problems.held_out import Case
+from robotdiffuse.problems.files import Case
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 

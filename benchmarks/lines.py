@@ -23,7 +23,7 @@ from common import header, parse, print_table, progress, use_processor_time
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.transforms import rotation_about, rotation_from_rpy, transform
 from robotdiffuse.problems.compiled_constraints import rotation_vector
-from robotdiffuse.problems.held_out import SEED, held_out_problem
+from robotdiffuse.problems.files import SEED, held_out_problem
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
 from robotdiffuse.robots.robot import Robot
 

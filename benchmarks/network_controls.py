@@ -46,7 +46,7 @@ from robotdiffuse.evaluation.runs import (
 from robotdiffuse.planning.diffusion import Diffusion, DiffusionSettings
 from robotdiffuse.planning.search.rrt import AORRTC
 from robotdiffuse.problems.families import FAMILIES
-from robotdiffuse.problems.held_out import Case
+from robotdiffuse.problems.files import Case
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.shapes import Box, Cylinder, Sphere

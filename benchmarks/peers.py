@@ -49,8 +49,7 @@ from common import (
 )
 from robotdiffuse.core.transforms import pose_entry
 from robotdiffuse.core.types import Path as JointPath
-from robotdiffuse.problems.files import ProblemEntry, load_motion_bench_maker
-from robotdiffuse.problems.held_out import goal_of
+from robotdiffuse.problems.files import ProblemEntry, goal_of, load_motion_bench_maker
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.shapes import Box, Cylinder
 from robotdiffuse.simulation.world import write_urdf

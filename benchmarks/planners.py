@@ -38,12 +38,11 @@ from common import (
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.types import LENGTH
 from robotdiffuse.core.types import Path as JointPath
-from robotdiffuse.evaluation.problem_sets import gather_cases
-from robotdiffuse.evaluation.runs import Clock, Record, planned, run_all
+from robotdiffuse.evaluation.runs import Clock, Record, gather_cases, planned, run_all
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.families import FAMILIES, load_family
-from robotdiffuse.problems.held_out import Case, goal_of
+from robotdiffuse.problems.files import Case, goal_of
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene

@@ -56,8 +56,7 @@ from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
 from robotdiffuse.core.types import PlanResult, Trajectory
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.start_goal import usable_start_goal
-from robotdiffuse.problems.files import load_motion_bench_maker
-from robotdiffuse.problems.held_out import SEED, held_out_problem
+from robotdiffuse.problems.files import SEED, held_out_problem, load_motion_bench_maker
 from robotdiffuse.problems.problem import Goal, JointGoal, PoseGoal, PosesGoal, Problem, poses_of
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.simulation.world import World

@@ -37,11 +37,10 @@ from torch import Tensor, nn
 
 from common import FIRST, header, parse, parts_of, print_table, progress, use_processor_time
 from robotdiffuse.baselines.controls import smooth_noise
-from robotdiffuse.core.output_files import JsonLines, write_atomically
+from robotdiffuse.core.files import JsonLines, write_atomically
 from robotdiffuse.datasets.shards import SPLITS, read_rows, read_shard, shard_indices
-from robotdiffuse.evaluation.problem_sets import case_file, validator
-from robotdiffuse.evaluation.runs import validated
-from robotdiffuse.evaluation.statistics import bootstrap_interval
+from robotdiffuse.evaluation.bench_comparisons import bootstrap_interval
+from robotdiffuse.evaluation.runs import case_file, validated, validator
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
 from robotdiffuse.generation.factory import GenerationSettings, generate
 from robotdiffuse.learning.checkpoint import load_encoder
@@ -60,7 +59,7 @@ from robotdiffuse.learning.training.loop import Processes, Validation, train
 from robotdiffuse.learning.training.tasks import PlannerTask, model_settings, train_encoder
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.planning.search.rrt import AORRTC
-from robotdiffuse.problems.held_out import Case, goal_of
+from robotdiffuse.problems.files import Case, goal_of
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes

@@ -29,8 +29,7 @@ import numpy as np
 
 import robotdiffuse as rd
 from common import header, parse, print_table
-from robotdiffuse.problems.files import problem_from_record, problem_record
-from robotdiffuse.problems.held_out import SEED, held_out_problem
+from robotdiffuse.problems.files import SEED, held_out_problem, problem_from_record, problem_record
 
 FAMILIES = ("rop", "shelf", "crate", "table")
 SEEDS = (0, 1)

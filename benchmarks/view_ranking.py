@@ -31,12 +31,12 @@ from numpy import ndarray
 from cameras import PLANNER, Row, expected_error, is_free, known_scene, problems, views
 from common import CONVERGED, FIRST, header, parse, print_table, use_processor_time
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
-from robotdiffuse.core.output_files import JsonLines
-from robotdiffuse.evaluation.statistics import bootstrap_interval, compare, wilson_interval
+from robotdiffuse.core.files import JsonLines
+from robotdiffuse.evaluation.bench_comparisons import bootstrap_interval, compare, wilson_interval
 from robotdiffuse.learning.completion import predict
 from robotdiffuse.perception.depth_view import DepthNoise
 from robotdiffuse.perception.observed_volume import observe
-from robotdiffuse.perception.unknown_space import CARVING_MARGIN, THRESHOLDS, OccupiedVoxels, confidence
+from robotdiffuse.perception.occupancy_map import CARVING_MARGIN, THRESHOLDS, OccupiedVoxels, confidence
 from robotdiffuse.perception.voxel_grid import COARSE, SHAPE, refined
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.pipeline.unknown_space import (

@@ -11,8 +11,7 @@ from PIL import Image
 
 import robotdiffuse as rd
 from robotdiffuse.drawables import drawables
-from robotdiffuse.visualization.arm import DrawnArm
-from robotdiffuse.visualization.picture import MARGINS, PictureSettings, render, view_of_motion
+from robotdiffuse.visualization.picture import MARGINS, DrawnArm, PictureSettings, render, view_of_motion
 
 ROOT = Path(__file__).parents[1]
 SIZE = PictureSettings(width=720, height=450, ghosts=1)
