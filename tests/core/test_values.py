@@ -311,6 +311,14 @@ def test_nobody_can_write_to_the_arrays_of_a_value(kind: type[Value]) -> None:
     assert all(np.array_equal(*pair) for pair in zip(before, GIVEN, strict=True))
 
 
+def test_nobody_can_change_a_robot_that_a_cache_shares() -> None:
+    """Regression: `robot.locked["panda_finger_joint1"] = 0` changed what `load_robot` returned from then on."""
+    for robot in (PANDA := rd.load_robot("panda"), pickle.loads(pickle.dumps(PANDA)), copy.deepcopy(PANDA)):
+        for change in (robot.locked.clear, robot.spheres.popitem, lambda robot=robot: robot.poses["ready"].update(j=1.0)):
+            with pytest.raises(TypeError, match="change a copy"):
+                change()
+
+
 def test_views_of_what_can_be_written_to_are_copied() -> None:
     mine = np.zeros((2, 3))
     view = mine[:1]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from pathlib import Path as FilePath
 from types import FunctionType, NoneType
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, NoReturn, TypeVar, dataclass_transform
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -155,10 +155,10 @@ def frozen_dataclass(kind: type[T]) -> type[T]:
 
 
 class Value:
-    """Base of the dataclasses that are values: the arrays in their fields are read-only.
+    """Base of the dataclasses that are values: the arrays and dictionaries in their fields are read-only.
 
-    Caches use the object's identity as the key, so its arrays must not change. A writable array is copied, so
-    that the caller's array stays writable. A subclass that defines `__post_init__` calls this class's
+    Caches use the object's identity as the key, so they must not change. What is writable is copied, so that
+    the caller can still change it. A subclass that defines `__post_init__` calls this class's
     `__post_init__` at its end.
     """
 
@@ -187,8 +187,8 @@ class Value:
 
 
 def read_only(value: T) -> T:
-    """Returns the value unchanged if all its arrays are read-only, else a copy with read-only arrays. Arrays
-    in tuples and dictionaries count too."""
+    """Returns the value unchanged if all its arrays and dictionaries are read-only, else a copy in which they
+    are. Those in tuples and dictionaries count too."""
     if isinstance(value, np.ma.MaskedArray):  # what a mask hides is missing
         return read_only(value.astype(np.float64).filled(np.nan))  # type: ignore[return-value]
     if isinstance(value, ndarray):
@@ -202,10 +202,21 @@ def read_only(value: T) -> T:
         if all(a is b for a, b in zip(frozen, value, strict=True)):
             return value
         return value._make(frozen) if hasattr(value, "_make") else tuple(frozen)  # type: ignore
-    if isinstance(value, dict):
-        frozen = {key: read_only(entry) for key, entry in value.items()}
-        return value if all(frozen[key] is value[key] for key in value) else frozen  # type: ignore[return-value]
+    if isinstance(value, dict) and not isinstance(value, ReadOnlyDict):
+        return ReadOnlyDict({key: read_only(entry) for key, entry in value.items()})  # type: ignore
     return value
+
+
+class ReadOnlyDict(dict[Any, Any]):
+    """A dictionary of a value. To have another one, change a copy: `dict(value.locked)`."""
+
+    def _refuse(self, *_: Any, **__: Any) -> NoReturn:
+        raise TypeError("this dictionary cannot be changed; change a copy: dict(...)")
+
+    __setitem__ = __delitem__ = __ior__ = update = setdefault = pop = popitem = clear = _refuse
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return read_only, (dict(self),)
 
 
 def for_kernels(array: ndarray, dtype: type = np.float64) -> ndarray:

@@ -105,7 +105,7 @@ def write_dataset(
     waypoints = converted("waypoints", Annotated[int, Bound(least=2.0)], waypoints)
     target = file_name(folder, "folder")
     check_type("paths", paths, Iterable, "a list of motions")
-    check_type("scenes", scenes, (Scene, list, tuple), "a rd.Scene, or a list of them")
+    check_type("scenes", scenes, (Scene, list, tuple), "an rd.Scene, or a list of them")
     motions = [_positions(arm, i, path) for i, path in enumerate(paths)]
     if not motions:
         raise InputError("paths is empty; a data set has at least one motion")
@@ -116,11 +116,12 @@ def write_dataset(
             f"for each of {len(motions)} paths"
         )
     for i, scene in enumerate(per_path):
-        check_type(f"scenes[{i}]", scene, Scene, "a rd.Scene")
+        check_type(f"scenes[{i}]", scene, Scene, "an rd.Scene")
         if scene.allowed_contacts:
             touched = joined([name for name, _ in scene.allowed_contacts])
             raise InputError(
-                f"scenes[{i}] has allowed_contacts with {touched}; data sets keep none: leave out the shapes"
+                f"scenes[{i}] has allowed_contacts with {touched}; data sets keep no allowed contacts: "
+                f"leave these shapes out of the scene"
             )
     floor = _shared_floor(per_path)
     slots = max(len(scene.shapes) for scene in per_path) - (floor is not None)
@@ -278,7 +279,7 @@ def import_npz(
     radius: float = SPHERE_RADIUS,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> int:
-    """Make a data set from a robot.npz in an empty folder; returns the number of its motions.
+    """Make a data set in an empty folder from a robot.npz; returns the number of its motions.
 
     Scenes are ROP's floor and two spheres of this radius [m]. Motions are not validated here; `robotdiffuse
     data check` validates them. Clearances, lengths and whether the straight line is free are measured. The

@@ -98,7 +98,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         if waypoints is not None:
             waypoints = converted("waypoints", Annotated[int, Bound(least=2.0)], waypoints)
         if robot is not None:
-            check_type("robot", robot, Robot, "a rd.Robot")
+            check_type("robot", robot, Robot, "an rd.Robot")
         self.manifest = read_manifest(folder)
         # the full path, since a copy from a pickle may be read in another working folder
         folder = Path(folder).absolute()

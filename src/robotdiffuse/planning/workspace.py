@@ -613,9 +613,9 @@ class Workspace:
         """Plan a motion of the tip along a straight line, with an evenly turning orientation.
 
         Args:
-            pose: End of the line: T_world_tip [4, 4]; or a `rd.PoseGoal`, `rd.JointGoal`, `rd.PosesGoal` or
-                `rd.AnyGoal`, in the frame of the base. For a `rd.PoseGoal` with tolerances, the line ends at
-                a pose within them that is near to the pose at the start. For a `rd.AnyGoal`, lines to the
+            pose: End of the line: T_world_tip [4, 4]; or an `rd.PoseGoal`, `rd.JointGoal`, `rd.PosesGoal` or
+                `rd.AnyGoal`, in the frame of the base. For an `rd.PoseGoal` with tolerances, the line ends at
+                a pose within them that is near to the pose at the start. For an `rd.AnyGoal`, lines to the
                 goals are tried until one is found, nearest goal first.
             start: Start configuration [dof], values by joint, or the name of a pose.
             tolerance: Largest distance of the tip from the line [m].
@@ -663,7 +663,7 @@ class Workspace:
         if matrices is not None and matrices.ndim == 3:
             raise InputError(
                 f"pose is {len(pose)} poses; a line has one end: give all poses but the last as waypoints, "
-                "or give a rd.AnyGoal to reach any one pose"
+                "or give an rd.AnyGoal to reach any one pose"
             )
         goals = pose.goals if several else [pose]
         if not isinstance(pose, Goal):

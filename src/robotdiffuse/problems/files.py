@@ -180,7 +180,7 @@ def problem_record(
     folder = None if folder is None else Path(folder)
     T = problem.T_world_base
     scene = problem.known_scene
-    record: dict[str, object] = {"robot": str(robot), "locked": dict(problem.robot.locked)}
+    record: dict[str, object] = {"robot": str(robot), "locked": problem.robot.locked}
     if T is not None:
         record["base"] = rounded(pose_entry(T))
     record |= equipment_entries(problem.robot, folder)
@@ -222,10 +222,11 @@ def save_problem(problem: Problem, file: str | Path, robot: str | None = None) -
 
 
 class _Dumper(yaml.CSafeDumper):
-    """Also writes NumPy's texts, such as names from an array."""
+    """Also writes NumPy's texts, such as names from an array, and read-only dictionaries."""
 
 
 _Dumper.add_multi_representer(str, lambda dumper, text: dumper.represent_str(str(text)))
+_Dumper.add_multi_representer(dict, yaml.CSafeDumper.represent_dict)
 
 
 def _yaml(data: dict[str, object]) -> str:

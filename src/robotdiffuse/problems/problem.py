@@ -267,7 +267,7 @@ def path_constraints(robot: Robot, constraints: Any) -> tuple[Constraint, ...]:
 def checked_payload(robot: Robot, payload: Any) -> Payload | None:
     if payload is None:
         return None
-    check_type("payload", payload, Payload, "a rd.Payload")
+    check_type("payload", payload, Payload, "an rd.Payload")
     check_dynamics(robot)
     robot.check_moved("payload.link", robot.tip if payload.link is None else payload.link)
     return payload

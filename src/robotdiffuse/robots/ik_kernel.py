@@ -227,6 +227,7 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
         jacobian_outdated = True
         for iteration in range(max_iterations):
             rotation = length(error[3:]) / rotation_weight
+            # `length` takes the first three numbers, the error of the position
             solved = length(error) <= position_tolerance and (position_only or rotation <= rotation_tolerance)
             if solved or damping > MAX_DAMPING:
                 break

@@ -145,7 +145,7 @@ def _extremes(times, q, v):
             chord[i], chords[j] = max(chord[i], bend), max(chords[j], bend)
             low = min(q[i, j], q[i + 1, j])
             high = max(q[i, j], q[i + 1, j])
-            # the exact range is needed only if it may extend the range so far
+            # the exact range is needed only if it may exceed `lower` to `upper`
             if low - bend < lower[j] or high + bend > upper[j]:
                 low, high = _range(q[i, j], speed, a, b, h, low, high)
                 lower[j], upper[j] = min(lower[j], low), max(upper[j], high)

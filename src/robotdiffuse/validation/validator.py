@@ -107,9 +107,9 @@ def static_pieces(q: Configurations) -> Pieces:
         configurations = q[piece] + share[:, None] * step[piece]
         return configurations, 0 * configurations, 0 * configurations
 
-    v = still.copy()
-    v[0] = np.abs(step)
-    return Pieces(states, Stretches(_farthest(q), v, still, still))
+    by_share = still.copy()  # derivatives of the positions with respect to the share
+    by_share[0] = np.abs(step)
+    return Pieces(states, Stretches(_farthest(q), by_share, still, still))
 
 
 def _farthest(q: Configurations) -> JointRows:
@@ -674,8 +674,8 @@ def violations(
     cubics = None
     if isinstance(motion, Trajectory):
         cubics = Cubics(motion)
-        rates = any(wrong.kind in RATE_KINDS for wrong in all_violations)
-        clock, q = (motion.times, q) if rates else cubics.sampled(settings.chord)[:2]
+        wrong_rates = any(wrong.kind in RATE_KINDS for wrong in all_violations)
+        clock, q = (motion.times, q) if wrong_rates else cubics.sampled(settings.chord)[:2]
     for contact in contacts(problem.robot, problem.scene, q, settings.contact):
         all_violations.append(collision_violation(contact, _time_at(contact.at, clock)))
     # `verify` may use a finer chord, and so find a contact that the search along these lines misses

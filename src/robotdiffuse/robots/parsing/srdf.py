@@ -91,7 +91,8 @@ class Srdf:
             while link != base:
                 if link not in above:
                     raise InputError(
-                        f"{self.path}: group {group}: no joints below the base lead from {base} to {tip}"
+                        f"{self.path}: group {group}: no joints below the robot's base lead from link "
+                        f"{base} to link {tip}"
                     )
                 names.add(above[link].name)
                 link = above[link].parent
@@ -336,7 +337,7 @@ def planned_joints(
     not_leading = [name for name in chosen or () if name not in {joint.name for joint in leading}]
     if not_leading:
         raise InputError(
-            f"{file}: {', '.join(not_leading)} of group {group} do not lead to {tip}; leave out --tip, or "
+            f"{file}: {tip} is not below {', '.join(not_leading)} of group {group}; leave out --tip, or "
             f"choose a group of one arm"
         )
     names = {joint.name for joint in leading if joint.mimic is None and joint.name not in srdf.passive}
