@@ -253,7 +253,7 @@ def test_proofs_refuse_grazing_and_name_the_pair() -> None:
     problem = rd.Problem(channel(), EMPTY, BESIDE, rd.JointGoal(np.zeros((1, 2))))
     path = rd.Path(channel().joint_names, np.stack([BESIDE, np.zeros(2)]))
     assert rd.verify(problem, path).valid
-    refuses("l2 and l0 are apart only by their exact surfaces", rd.certify, problem, path)
+    refuses("the exact surfaces of l2 and l0 are apart, but", rd.certify, problem, path)
 
 
 def test_folders_keep_the_surfaces_and_refuse_those_of_other_meshes(tmp_path: Path) -> None:

@@ -376,7 +376,7 @@ def test_robots_named_at_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     shutil.copytree(DATA / "panda", tmp_path / "mine")
     assert set(served_robots(["mine"])) == {*ROBOTS, "mine"}
     for name in ("panda", str(tmp_path / "mine")):  # the robot in the folder is also called panda
-        refuses("has the name panda of another robot", served_robots, [name])
+        refuses("the server has a robot named panda already", served_robots, [name])
     refuses("unknown robot 'yours'", served_robots, ["yours"])
 
 

@@ -84,7 +84,7 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
             candidate = planning.best()
             rounds += 1
             if candidate.broken == 0:
-                methods = " and RRT-Connect" if planning.searched else ""
+                methods = ", then RRT-Connect" if planning.searched else ""
                 reason = (
                     f"solved by {self.name}: round {rounds}; neural replannings: {planning.replanned}"
                     f"{methods}"
@@ -98,8 +98,8 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
         result = None if best is None else context.finish(start_goal.complete(best.path), self.name)
         remedy = "a longer time limit" if settings.hybrid else "a longer time limit or hybrid replanning"
         return result or context.unsolved(
-            f"no path of the network was valid in {context.elapsed:.2f} s, by round {rounds}; {remedy} may "
-            "find one"
+            f"no path of the network was valid in {context.elapsed:.2f} s (rounds: {rounds}); {remedy} "
+            "may find one"
         )
 
 

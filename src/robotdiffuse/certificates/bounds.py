@@ -40,7 +40,7 @@ from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape
 CLEARANCE_CAP = 1.0
 """Larger clearances count as this [m]."""
 PLANE_RANGE = 0.2
-"""Triangles and points further than this from the ball around a part need no planes, and count as this far
+"""Triangles and points farther than this from the ball around a part need no planes, and count as this far
 away [m]."""
 EXACT_TRIANGLE_RANGE = 4.0
 """A triangle is replaced by the ball around it at distances of more than this many radii of the ball."""
@@ -637,7 +637,7 @@ class MovingProver(Prover):
         links = np.array([self._link_index[claim.link] for claim in self.claims])[stretches.claim]
         number = {moving_obstacle.name: i for i, moving_obstacle in enumerate(self.moving)}
         obstacle_indices = np.array([number[claim.against] for claim in self.claims])[stretches.claim]
-        speed, bounded, reference_pose = (
+        speed, known, reference_pose = (
             np.array(values)[obstacle_indices]
             for values in zip(
                 *(
@@ -647,7 +647,7 @@ class MovingProver(Prover):
                 strict=True,
             )
         )
-        obstacle_motion = speed * np.where(bounded, np.maximum(at - begin, end - at), np.maximum(end, 0.0))
+        obstacle_motion = speed * np.where(known, np.maximum(at - begin, end - at), np.maximum(end, 0.0))
         T = np.array([self.moving[i].pose(time) for i, time in zip(obstacle_indices, at, strict=True)])
 
         def distances(row: ndarray, _: ndarray, centers: ndarray) -> Values:

@@ -215,7 +215,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         raise InputError(UNTIMED)
     if report.violation is not None:
         raise NotValidError(f"the motion is not valid: {report.violation.line}")
-    # files hold float64: bounds computed in float32, as of PyTorch's rows, would differ from those checked
+    # files hold float64; bounds of float32 rows, such as PyTorch's, would differ from the bounds checked
     names = ("positions", *(RATE_ROWS if isinstance(motion, Trajectory) else ()))
     motion = replace(motion, **{name: np.asarray(getattr(motion, name), np.float64) for name in names})
     required = {
@@ -305,8 +305,8 @@ def _refined(
 
 
 def _between(motion: Path | Trajectory, chord: float) -> Values:
-    """Times between the rows at which configurations are added, so that no joint leaves the straight lines
-    between configurations by more than `chord` [rad] or [m]."""
+    """Places between the rows (see `MotionProof.between`) at which configurations are added, so that no joint
+    leaves the straight lines between configurations by more than `chord` [rad] or [m]."""
     cubics = cubics_of(motion)
     off = (cubics.peak_accelerations * cubics.steps**2 / 8).max(axis=1)
     parts = np.maximum(np.ceil(np.sqrt(off / chord)), 1).astype(int)
@@ -384,8 +384,8 @@ def _check_parts_are_apart(prover: Prover, stretches: Stretches) -> None:
         claim = prover.claims[k]
         if frozenset((claim.link, claim.against)) in prover.robot.grazing:
             raise InputError(
-                f"no proof exists: {claim.link} and {claim.against} are apart only by their exact surfaces, "
-                f"and proofs use the convex parts around them, which touch"
+                f"no proof exists: the exact surfaces of {claim.link} and {claim.against} are apart, but "
+                f"proofs use the convex parts around them, which touch"
             )
 
 

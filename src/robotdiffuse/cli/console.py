@@ -115,7 +115,7 @@ def clearances(motion: "PlanResult | Report | Certificate", target: float | None
 
 
 def _certified(clearance: float) -> str:
-    """A certified lower bound [m]; the validator measures no distance beyond CLEARANCE_CAP."""
+    """The text for a certified lower bound [m]; the validator measures no distance beyond CLEARANCE_CAP."""
     capped = clearance > CLEARANCE_CAP - CAP_TOLERANCE
     # + 0.0 turns -0.0 into 0.0
     return f"> {CLEARANCE_CAP:g} m" if capped else f"at least {1e3 * clearance + 0.0:.1f} mm"

@@ -32,6 +32,6 @@ def served_robots(names: Sequence[str]) -> dict[str, Robot]:
         robot = load_robot(name)
         request_name = name if name in known_robots() else robot.name
         if request_name in robots:
-            raise InputError(f"robot {shown(name)} has the name {request_name} of another robot")
+            raise InputError(f"robot {shown(name)}: the server has a robot named {request_name} already")
         robots[request_name] = robot
     return robots

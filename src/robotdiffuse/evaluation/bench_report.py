@@ -1,4 +1,4 @@
-"""The report of a bench: tables, plots and motions to replay of the comparisons of its planners."""
+"""The report of a bench: comparisons of its planners as tables and plots, and motions to replay."""
 
 import re
 from collections import Counter
@@ -50,9 +50,9 @@ UNEQUAL_NOTE = (
     "--equal-time of bench run repeats such calls until the limit."
 )
 NOTES = """\
-- A call counts in a table if its own limit was at least that of the table. A call that ended by itself
-  before its limit counts too, since more time would have changed nothing. A table compares the problems on
-  which all its planners have such a call.
+- A call counts in a table if its own limit was at least that of the table. A call with a smaller limit
+  counts too if it ended by itself before that limit, since more time would have changed nothing. A table
+  compares the problems on which all its planners have such a call.
 - success: share of problems with a verified motion found by the limit, with the 95 % interval over problems
   (Wilson). A motion returned after the call's own limit counts if it is late by at most 10 % of the limit
   or 50 ms, whichever is more: planners stop in time, and validation follows.
@@ -191,8 +191,8 @@ def _table(heading: str, rows: Sequence[Row], spec: Spec) -> Table:
 
 def _ratio(comparison: Comparison, reference: str) -> PlannerColumn:
     """A column with the ratio of path lengths to those of the reference planner, and its interval. The cell
-    is empty if no problem is solved by both, and if the planner or the reference ended early and there is a
-    row of the planner with restarts, which shows the ratio."""
+    is empty if no problem is solved by both. It is also empty if the planner or the reference ended early,
+    and a row of the planner with restarts shows the ratio instead."""
     full = {row.planner: row.full for row in comparison.rows}
 
     def ratio(row: Row) -> Cell:
@@ -389,7 +389,7 @@ def motions_to_replay(bench: Bench, parts: Sequence[Section]) -> list[Replay]:
     are considered.
     """
     tries: list[tuple[Case, list[Record], dict[str, str]]] = []
-    # without the sections of non-trivial problems only
+    # sections that hold only the non-trivial problems are left out
     for section in (section for section in parts if section.name == section.problem_set):
         main = section.main
         calls = [calls_on(bench.records[row.planner], section.problem_set) for row in main.rows]
@@ -429,7 +429,7 @@ def _failure(case: Case, solved: list[Record], failed: dict[str, str], reference
     goal = case.problem.goal
     if failed and solved:
         loser = reference if reference in failed else next(iter(failed))
-        caption = f"{failed[loser]}; shown: {solved[0].planner}, {len(solved)} solve it"
+        caption = f"{failed[loser]}; shown: {solved[0].planner}; solved by {counted(len(solved), 'planner')}"
         yield Replay(f"{loser} fails · {case.name}", caption, case, solved[0].waypoints)
     elif failed and isinstance(goal, JointGoal):
         caption = "solved by no planner; shown: the straight line, which is no solution"

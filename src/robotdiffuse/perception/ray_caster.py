@@ -214,7 +214,7 @@ def looking_at(position: Float[ndarray, "3"], target: Float[ndarray, "3"], roll:
     """T_base_camera of a camera at `position` that looks at `target`, upright except for `roll` [rad].
 
     x is to the right in the image, y down, z forward. If the camera looks straight down, the top of the image
-    is towards +x.
+    is towards the +x of the base.
     """
     z = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
     right = np.array([z[1], -z[0], 0.0])

@@ -324,8 +324,8 @@ class StopGraph:
 
     def sample(self, radii: JointValues, travel: float) -> tuple[Values, Configurations]:
         """Values of s, including all stops, and the configurations there [n, dof]. Between neighboring stops,
-        the values are equally spaced. Their number is such that the steps of any point of the arm have a mean
-        length of at most `travel` [m]. radii: from `motion_radii`."""
+        the values are equally spaced, so closely that from each to the next, any point of the arm moves by at
+        most `travel` [m] on average. radii: from `motion_radii`."""
         parts = []
         for low, high in zip(self.stops[:-1], self.stops[1:], strict=True):
             samples = self.line(np.linspace(low, high, 33), 0)
@@ -335,16 +335,16 @@ class StopGraph:
         return s, self.line(s, 0)
 
     def nearest_samples(self, motion: Motion, configurations: Configurations) -> Int[ndarray, "ticks"]:
-        """For each tick of a motion, from its start to its end, the index of the nearest configuration among
-        `configurations`."""
+        """For each of the `ticks` + 1 times of a motion, its start and end included, the index of the nearest
+        configuration among `configurations`."""
         times, q = motion.rows[:2]
         at = interpolated(self.step * np.arange(motion.ticks + 1), times, q)
         # squared distances, without the term that is the same for all configurations
         return ((configurations**2).sum(axis=1) - 2 * at @ configurations.T).argmin(axis=1)
 
     def trajectory(self, motions: list[Motion | int]) -> Trajectory:
-        """The trajectory of motions one after the other; an integer in `motions` is a wait of one time
-        step."""
+        """The trajectory of motions one after the other; an integer in `motions`, whatever its value,
+        is a wait of one time step."""
         q = self.line(self.stops[:1], 0)
         segments = [(np.zeros(1), q, 0 * q, 0 * q)]  # motions begin and end without acceleration
         for part in motions:

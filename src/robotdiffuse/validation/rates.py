@@ -8,10 +8,10 @@ rest before the first row (or to move at the problem's start velocity) and after
 
 Rates agree with the positions if some motion within the limits has these rates and positions. If a joint's
 velocity changes from v0 to v1 in a step of h seconds with accelerations up to A, it moves by h (v0 + v1) / 2
-± (A h² - (v1 - v0)² / A) / 4. The extremes are full acceleration followed by full braking, and the reverse. A
-is twice the greatest acceleration measured by rows, positions or velocities, but at most the limit with its
-tolerance. The acceleration of a row must be in or near the interval between those that the cubics before and
-after it have there.
+± (A h² - (v1 - v0)² / A) / 4. The extremes are full acceleration followed by full braking, and the
+reverse. Here, A is twice the greatest acceleration that the rows state or that follows from their positions
+or velocities, but at most the limit with its tolerance. The acceleration of a row must be in or near the
+interval between those that the cubics before and after it have there.
 
 Positions have a limited resolution, which hides any velocity over a step of nanoseconds. If rows are closer
 than a millisecond, the tests are therefore repeated between rows that are further apart.
@@ -152,8 +152,8 @@ def _checks(
     limits = robot.acceleration
     measured = np.maximum(_peak(a, second, change), settings.rate_slack * robot.acceleration)
     strongest = np.where(limits > 0, np.minimum(limit_factor * limits, 2 * measured), 2 * measured)
-    # With accelerations up to A, the mean velocity of a step of h seconds, in which the velocity changes by d
-    # h, differs from the mean of both velocities by at most (A - d² / A) h / 4.
+    # Let the velocity change by d h in a step of h seconds. With accelerations up to A, the mean velocity of
+    # the step differs from the mean of the velocities at its two ends by at most (A - d² / A) h / 4.
     spent = np.divide(change**2, strongest, out=np.zeros_like(change), where=strongest > 0)
     possible = np.maximum(strongest - spent, 0.0) * step / 4 + rest_tolerance
     """Allowed difference between mean velocities and the means of the rows' velocities."""

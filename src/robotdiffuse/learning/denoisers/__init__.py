@@ -1,8 +1,8 @@
-"""Denoisers, networks that predict the clean trajectory, or its noise, from a noisy one, and their settings.
+"""Settings of denoisers: networks that predict the clean trajectory, or the noise, from a noisy trajectory.
 
 Nothing here loads PyTorch, so that planning can read the settings. The networks are in `denoisers.networks`.
 
-The second and third column of the table are the millions of parameters for a Panda, with the default
+The second and third columns of the table are the millions of parameters for a Panda, with the default
 settings (48 waypoints) and with `PAPER_SIZES` (254 waypoints). The last two columns are the time of a forward
 pass with the default settings, relative to the transformer, which takes 5.8 ms in bf16 and 10.7 ms in fp32
 (batch of 16, one thread, torch 2.13, CPU with AVX-512 BF16). Other processes were running, so times are

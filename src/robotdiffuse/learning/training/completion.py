@@ -282,7 +282,7 @@ def fitted_temperature(logits: Floats, truth: Flags) -> float:
 
 def calibration_error(p: Floats, truth: Flags) -> float:
     """Expected calibration error: the mean over the voxels of |mean predicted probability - share of occupied
-    voxels| of their bins."""
+    voxels|, both taken over the voxel's bin."""
     bins = np.minimum((p * CALIBRATION_BINS).astype(int), CALIBRATION_BINS - 1)
     errors = np.bincount(bins, p.astype(np.float64) - truth, CALIBRATION_BINS)
     return float(np.abs(errors).sum() / max(1, len(p)))

@@ -1,4 +1,4 @@
-"""Parts of the paper's losses L_joint, L_point and L_collision of a predicted motion, differentiable.
+"""Differentiable parts of the paper's losses L_joint, L_point and L_collision, which rate predicted motions.
 
 L_joint compares motions of the joints, L_point motions of points on the arm's surface, and L_collision is the
 hinge h on the signed distance of the arm to obstacles (paper, section "Optimize via Robot Feedback").

@@ -513,7 +513,8 @@ class Explorer:
         if safe_motion is not None and self._may_go(safe_motion, safe_policy):
             return self._go(safe_motion, safe_policy)
         predicted = self.predicted() if predicted is None else predicted
-        # the motion to a viewpoint is through space seen free if possible, under both policies
+        # The motion to a viewpoint is through space seen free if possible, under all policies. With
+        # strict_then_probabilistic, the strict policy has tried this before the probabilistic one.
         policies = (STRICT, PROBABILISTIC) if self.settings.policy == PROBABILISTIC else (policy,)
         for look_policy in policies:
             look = self._way_to_look(problem, look_policy, to_view, predicted)
@@ -690,6 +691,7 @@ class Explorer:
         """The unknown voxels of the map, except voxels that the arm fills at the configurations `ends`."""
         lost = None
         if predicted is None:
+            # rays without a return lead there; a confidence without a prediction depends on it
             lost = np.pad(lost_regions(self._views.volume()), ((0, 0), (0, 0), (LAYERS_BELOW, 0)))
         return UnknownSpace(self.robot, ends, self.map.unknown, predicted, 0.0, MAP, lost)
 

@@ -113,7 +113,7 @@ class Step:
     """A solved result; None if the arm shall stay. A strict motion is certified against obstacles that cover
     all space not seen free; `motion.problem` holds these obstacles."""
     confidence: float | None = None
-    """Stated probability that a motion is free, under the probabilistic policy."""
+    """Stated probability that `motion` is free, under the probabilistic policy."""
     seen: Scene | None = None
     """The known scene and the points of the views that the Explorer still uses; None if nothing was
     planned."""
