@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -286,6 +287,9 @@ def test_shapes_from_files_are_written_as_names_of_files(tmp_path: Path) -> None
     assert written == [{"mesh": {"file": "box.stl", "xyz": [0.0, 0.0, 1.0]}}, entries[1]]
     assert scene_entries(scene, None)[0]["mesh"]["file"] == str((tmp_path / "box.stl").resolve())
     assert_equal(scene, read_scene(written, tmp_path)[0])
+    # regression: points that were replaced since were lost, since their old file was named
+    changed = rd.Scene([replace(scene.shapes[1], points=[[3.0, 2, 1]])])
+    assert read_scene(scene_entries(changed, tmp_path), tmp_path)[0].shapes[0].points.tolist() == [[3, 2, 1]]  # type: ignore
 
 
 def test_meshes_and_clouds_from_files_with_a_scale(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 dictionaries."""
 
 from collections.abc import Collection, Iterable
+from contextlib import suppress
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
@@ -152,13 +153,24 @@ def _content(kind: type[Shape], file: str, notes: list[str]) -> tuple[ndarray, .
     return (points,)
 
 
+def _in_file(shape: Shape) -> bool:
+    """Whether the shape has a file that still holds its arrays."""
+    file = getattr(shape, "file", None)
+    if file is None:
+        return False
+    with suppress(InputError):
+        arrays = [getattr(shape, name) for name in FILE_CONTENT[shape.kind]]
+        stored = _content(type(shape), file, [])
+        return all(np.array_equal(*pair, equal_nan=True) for pair in zip(arrays, stored, strict=True))
+    return False
+
+
 def scene_entries(scene: Scene, folder: Path | None) -> list[dict[str, dict[str, object]]]:
-    """The scene as entries from which `read_scene` restores it exactly. For shapes that were read from files,
-    the file name is written."""
+    """The scene as entries from which `read_scene` restores it exactly. For shapes that are as in their
+    files, the file name is written."""
     entries = []
     for shape in scene.shapes:
-        file = getattr(shape, "file", None)
-        if file is None:
+        if not _in_file(shape):
             values = plain_fields(shape, "file")
             if isinstance(shape, HeightMap):  # JSON has no NaN: holes are null
                 heights = shape.heights.astype(object)
@@ -166,7 +178,7 @@ def scene_entries(scene: Scene, folder: Path | None) -> list[dict[str, dict[str,
                 values["heights"] = heights.tolist()
         else:
             values = plain_fields(shape, "file", *FILE_CONTENT[shape.kind])
-            values = {"file": name_from(folder, Path(file)), **values}
+            values = {"file": name_from(folder, Path(shape.file)), **values}
         if values["name"] == shape.kind:
             del values["name"]
         if values.get("wxyz") == list(IDENTITY):

@@ -333,7 +333,8 @@ class PointCloud(Shape):
     Args:
         points: The points [n, 3] in the frame of the robot's base [m].
         point_radius: Radius of the sphere around each point [m].
-        file: The file that the cloud was read from. A problem that is saved refers to this file.
+        file: The file that the cloud was read from. A saved problem refers to this file if it still
+            holds these points.
         name: Name in results, commands and allowed contacts.
     """
 
@@ -441,7 +442,8 @@ class Mesh(_Posed, Triangulated):
         faces: Indices of vertices [n, 3], from 0.
         xyz: Position of the mesh's frame in the frame of the robot's base [m].
         wxyz: Orientation of the mesh's frame as a quaternion, scalar first.
-        file: The file that the mesh was read from. A problem that is saved refers to this file.
+        file: The file that the mesh was read from. A saved problem refers to this file if it still
+            holds this mesh.
         name: Name in results, commands and allowed contacts.
     """
 
@@ -534,7 +536,8 @@ class HeightMap(_Posed, Triangulated):
         xyz: Position of the height map's frame in the frame of the robot's base [m]. The origin of the height
             map's frame is the first point of the grid, at height 0.
         wxyz: Orientation of the height map's frame as a quaternion, scalar first.
-        file: The file that the heights were read from. A problem that is saved refers to this file.
+        file: The file that the heights were read from. A saved problem refers to this file if it still
+            holds these heights.
         name: Name in results, commands and allowed contacts.
     """
 
