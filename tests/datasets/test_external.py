@@ -14,6 +14,7 @@ from helpers.stores import line, random_arrays, record, write_motions, write_sto
 from robotdiffuse.datasets import external as robot_npz
 from robotdiffuse.datasets.external import export_npz, import_npz
 from robotdiffuse.datasets.shards import SPLITS, check_shard, problem_of, read_manifest, read_shard, write_shard
+from robotdiffuse.evaluation.checks import check_data
 from robotdiffuse.scenes.scene_arrays import SPHERE
 
 
@@ -148,6 +149,19 @@ def test_own_motions_are_a_data_set_like_any_other(tmp_path, said: Said):
     assert next(iter(rd.RopDataset(tmp_path / "own").batches(4))).trajectories.shape[1:] == (48, 7)
     assert "24" in said(0, "data", "check", tmp_path / "own", "--workers", 1, "--no-pybullet")
     refuses("holds data already", rd.write_dataset, MOTIONS, SCENES, tmp_path / "own", PANDA)
+
+
+def test_own_motions_turn_the_short_way_keep_the_limits_and_may_be_closed(tmp_path: Path) -> None:
+    """Regression: logs wrapped to ±pi were stored as whole turns, and `data check` refused closed or slightly wide motions."""
+    wrapped = np.tile([0, 0.3, 0, 1.2, 0, 0.8, 0.0], (9, 1))
+    wrapped[:, 0] = (np.linspace(2.8, 3.6, 9) + np.pi) % (2 * np.pi) - np.pi
+    rd.write_dataset([wrapped] * COUNT, SCENES, tmp_path / "gen3", "gen3", waypoints=32)
+    np.testing.assert_allclose(read_shard(tmp_path / "gen3", 0)["cost"], 0.8, atol=1e-5)
+    wide = HOME + np.eye(7)[0] * (PANDA.upper[0] + 9e-4 - HOME[0])
+    rd.write_dataset([[HOME, wide, HOME]] * COUNT, SCENES, tmp_path / "own", "panda", waypoints=17)
+    assert not check_data(tmp_path / "own", pybullet=False).findings
+    opened = rd.load_robot("panda", locked={"panda_finger_joint1": 0.0})
+    refuses("as it is", rd.write_dataset, MOTIONS, SCENES, tmp_path / "new", opened)
 
 
 def test_what_is_wrong_is_named(tmp_path: Path) -> None:

@@ -229,6 +229,7 @@ def test_a_planner_with_settings_or_weights_of_the_package() -> None:
     assert calls.request()["until"] == "time_limit" and calls.request()["clearance"] == 0
     assert calls.load().settings == AORRTCSettings(gain=0.01)
     refuses("until 'soon'; known: converged", bench.PlannerSpec.parse, "aorrtc:until=soon")
+    refuses("name them after @: diffusion@WEIGHTS", bench.PlannerSpec.parse, "diffusion:weights=panda")
     nested = bench.PlannerSpec.parse("diffusion:guidance.margin=0.02:samples=4").load()
     assert isinstance(nested, Diffusion)
     assert (nested.settings.guidance.margin, nested.settings.samples) == (0.02, 4)

@@ -44,6 +44,10 @@ def test_one_rule(tmp_path: Path, kept: bool) -> None:
     every = cases.held_out("rop", 8, referee.validator)
     assert [case.trivial for case in every] == [i % 3 == 0 for i in range(8)]
     assert [case.hard for case in every] == [i in (1, 2, 4, 7) for i in range(8)]
+    gen3 = rd.load_robot("gen3")
+    turned = rd.Problem(gen3, rd.Scene([]), [0, 0.3, 0, 1.2, 0, 0.8, 3.0], [0, 0.3, 0, 1.2, 0, 0.8, -3.0])
+    length = line_length(turned, lambda problem, path: rd.verify(problem, path).valid)
+    assert length == pytest.approx(2 * np.pi - 6), "it was refused as a jump"
     assert every[5].reference is None and every[6].reference == pytest.approx(line_length(every[6].problem, referee.validator))
     for i, case in enumerate(every):
         assert np.array_equal(case.problem.start, held_out_problem("rop", i).start)

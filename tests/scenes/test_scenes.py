@@ -155,6 +155,7 @@ def test_thinning_keeps_one_point_of_each_cell(rows: list[tuple[float, float, fl
 
 
 def test_thinning_of_points_far_apart_and_crop() -> None:
+    refuses("voxel_thin.voxel is 0.0", voxel_thin, np.zeros((2, 3)), 0.0)
     assert len(voxel_thin(np.array([[-1e9, 0, 0], [1e9, 5e8, 1e9], [1e9, 5e8, 1e9], [0, 0, 0]]), 1e-3)) == 3
     row = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
     assert (crop(row, np.array([1.0, 0, 0]), 1.0) == row[:2]).all()
@@ -227,6 +228,7 @@ PACKED = PCD.format(n=10**9, data="binary_compressed").encode() + struct.pack("<
             "states 50 vertices, faces and other elements, but it holds 49",
         ),
         ("cloud.csv", b"t,x,y\n0,1,2\n", "has the columns .'t', 'x', 'y'.; it must have x, y and z"),
+        ("cloud.csv", b"time,Points:0,Points:1,Points:2\n5,1,2,3\n", "it must have x, y and z"),
         ("cloud.npy", npy(POINTS + 1j), "holds complex128 of 50 x 3; it must be numbers"),
         ("cloud.npy", npy(POINTS > 0), "holds bool of 50 x 3; it must be numbers"),
         ("cloud.npy", npy(np.ones((3, 5000))), "holds float64 of 3 x 5000; it must be numbers, n x 3"),

@@ -42,7 +42,7 @@ from robotdiffuse.datasets.shards import (
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.problem import LIMIT_SLACK, checked_configuration
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.robot import Robot, check_joints
+from robotdiffuse.robots.robot import Robot, check_joints, robot_fingerprint
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.shapes import Box, Sphere
@@ -104,6 +104,12 @@ def write_dataset(
     arm = robot if isinstance(robot, Robot) else load_robot(robot)
     waypoints = converted("waypoints", Annotated[int, Bound(least=2.0)], waypoints)
     target = file_name(folder, "folder")
+    source = arm.source or arm.name
+    if robot_fingerprint(load_robot(source)) != robot_fingerprint(arm):
+        raise InputError(
+            f"robot is {arm!r}; it must be load_robot({source!r}) as it is: data sets keep no tool, no held "
+            "objects and no other locked joints"
+        )
     check_type("paths", paths, Iterable, "a list of motions")
     check_type("scenes", scenes, (Scene, list, tuple), "an rd.Scene, or a list of them")
     motions = [_positions(arm, i, path) for i, path in enumerate(paths)]
@@ -133,7 +139,7 @@ def write_dataset(
     q = np.stack([resample(motion[None].astype(np.float32), waypoints)[0] for motion in motions])
     about = {"families": {FAMILY: {}}, "floors": {FAMILY: floor}, "slots": slots}
     about["settings"] = {"imported": "write_dataset"}
-    return _write(target, arm, arm.source or arm.name, per_path, q, about)
+    return _write(target, arm, source, per_path, q, about)
 
 
 def _write(
@@ -217,7 +223,9 @@ def _positions(robot: Robot, i: int, path: object) -> ndarray:
     if not within.all():
         row = int(within.min(axis=1).argmin())
         checked_configuration(robot, f"paths[{i}], row {row}", q[row], [])
-    return q
+    q = np.where(robot.continuous, q, np.clip(q, robot.lower, robot.upper))
+    turns = np.concatenate([robot.whole_turns(q[:1]), robot.wraps(q)])
+    return q - np.cumsum(turns, axis=0)  # continuous joints may be wrapped to [-pi, pi]
 
 
 def _shared_floor(scenes: Sequence[Scene]) -> Box | None:

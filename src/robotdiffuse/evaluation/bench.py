@@ -76,6 +76,8 @@ class PlannerSpec:
         planner_text, *settings = text.split(":")
         name, at, folder = planner_text.partition("@")
         PLANNERS.entry(name)
+        if any(setting.startswith("weights=") for setting in settings):
+            raise InputError(f"planner {text!r} sets weights; name them after @: {name}@WEIGHTS")
         spec = cls(name, str(folder_of(folder).resolve()) if at else None, tuple(settings))
         spec.request()
         if settings:

@@ -317,10 +317,9 @@ def _lengths(shard: Shard, row: int, path: Path) -> Defects:
     detour = float(shard["detour"][row])
     if not cost * (1 - COST_TOLERANCE) - ROUNDING <= path.length <= cost * (1 + ROUNDING) + ROUNDING:
         yield "cost", f"cost is {cost:.4f} rad; the path through the waypoints has {path.length:.4f} rad"
-    straight = float(np.linalg.norm(path.positions[-1] - path.positions[0]))
+    straight = max(float(np.linalg.norm(path.positions[-1] - path.positions[0])), 1e-9)
     if abs(detour * straight - cost) > ROUNDING * max(cost, 1.0):
-        ratio = cost / max(straight, 1e-9)
-        yield "cost", f"detour is {detour:.4f}; cost over the straight distance is {ratio:.4f}"
+        yield "cost", f"detour is {detour:.4f}; cost over the straight distance is {cost / straight:.4f}"
 
 
 # Motions of a bench

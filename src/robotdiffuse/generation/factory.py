@@ -183,8 +183,8 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     """Solve the problem with a number. Returns its row, or "thinned", "unsolved" or "refused"."""
     rng = np.random.default_rng([settings.seed, number])
     family, sample = draw(settings, robot, rng)
-    # joints with limits and a range above one turn are turned as near to the start as possible
-    goals = np.stack([robot.equivalent_configurations(q, sample.start)[0] for q in sample.goals])
+    # joints that can turn by more than one turn are turned as near to the start as possible
+    goals = robot.nearest_turns(sample.goals, sample.start)
     sample = replace(sample, goals=goals)
     checker = CollisionChecker(robot, sample.scene)
     space = search_space(checker, settings.search.resolution)

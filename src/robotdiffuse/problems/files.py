@@ -452,7 +452,9 @@ def held_out_problem(family: str, number: int) -> Problem:
 def line_length(problem: Problem, validator: Validator) -> float | None:
     """Length of the shortest straight line, from the start to a goal configuration, that passes the validator
     [rad]; None if no such line does."""
-    goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
+    robot = problem.robot
+    goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else np.zeros((0, robot.dof))
+    goals = goals - robot.whole_turns(goals - problem.start)
     lines = [Waypoints(problem.robot.joint_names, np.stack([problem.start, goal])) for goal in goals]
     return min((line.length for line in lines if validator(problem, line)), default=None)
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, reading, shown
+from robotdiffuse.core.errors import InputError, positive, reading, shown
 from robotdiffuse.core.files import file_name, input_file, known_ending, read_array, read_bytes
 from robotdiffuse.core.mesh_files import check_ply
 from robotdiffuse.core.types import Points, Vector
@@ -131,6 +131,7 @@ def voxel_thin(points: Points, voxel: float) -> Points:
 
     Every removed point is less than sqrt(3) * voxel away from a remaining point.
     """
+    voxel = positive("voxel_thin", "voxel", voxel)
     if len(points) == 0:
         return points
     cells = np.floor(points * (1 / voxel))
@@ -215,7 +216,7 @@ def _read_text(file: Path) -> ndarray:
     except ValueError:
         header = True
     named = {"x", "y", "z"} & {*names}
-    if header and named and len(named) < 3 and first[0] not in "#/":
+    if header and len(named) < 3 and (named or len(names) > 3) and first[0] not in "#/":
         raise InputError(f"it has the columns {shown(names)}; it must have x, y and z")
     columns = [names.index(axis) for axis in "xyz"] if header and len(named) == 3 else None
     if header and not following:

@@ -406,7 +406,7 @@ def mesh(folder: Path) -> Path:
 def test_packages_by_option_environment_and_upwards(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     far = mesh(tmp_path / "ws" / "src" / "some_arm")
     file = written(tmp_path / "elsewhere", PARTS)
-    assert NAME in refuses("--package some_arm=FOLDER, or ROS_PACKAGE_PATH", read_urdf, file)
+    assert NAME in refuses("ROS_PACKAGE_PATH, or robot add --package some_arm=FOLDER", read_urdf, file)
     assert "end" in read_urdf(file, packages={"some_arm": far}).meshes
     assert UrdfTree(file, {"some_arm": far}).digest
     for variable, folder in (

@@ -68,8 +68,8 @@ class Processes:
         with needs("accelerate", "train"):
             from accelerate import Accelerator, PartialState
         cpu = device == "cpu" or not cuda
-        # Attention has weights below 1e-38, with which processors compute slowly: steps of config `paper` took a
-        # third longer. Threads have the setting of the time at which they begin: before the first product.
+        # Attention has weights below 1e-38, with which processors compute slowly: a step of config `paper`
+        # took a third longer. Threads keep the setting under which they began, at the first product.
         torch.set_flush_denormal(True)
         bf16 = fast_bf16() if cpu else torch.cuda.is_bf16_supported(including_emulation=False)
         device_type = "cpu" if cpu else "cuda"

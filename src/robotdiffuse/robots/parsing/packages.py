@@ -63,7 +63,10 @@ class Packages(NamedTuple):
             places = [] if folder is None else [folder]
             places += (up / below for up in (start, *start.parents) for below in (package, ""))
             where = f"the package is {folder}" if folder else f"searched from {start} upwards"
-            advice = f" ({where}); give the package's folder: --package {package}=FOLDER, or ROS_PACKAGE_PATH"
+            advice = (
+                f" ({where}); give the package's folder: ROS_PACKAGE_PATH, or robot add --package "
+                f"{package}=FOLDER"
+            )
         else:
             rest = filename.removeprefix("file://")
             places = [start]

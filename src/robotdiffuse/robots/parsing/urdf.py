@@ -316,7 +316,10 @@ class UrdfTree:
             digest.update(repr((allowed, self.semantics.poses)).encode())
         for element in self.links.values():
             for mesh in element.findall(f"{self.kind}/geometry/mesh"):
-                digest.update(read_bytes(self.packages.file(mesh.get("filename", "")), "mesh file"))
+                file = self.packages.file(mesh.get("filename", ""))
+                digest.update(read_bytes(file, "mesh file"))
+                if file.suffix.lower() == ".gltf":  # its buffers may be other files
+                    digest.update(read_triangles(file)[0].tobytes())
         return digest.hexdigest()
 
     @cached_property
