@@ -13,7 +13,7 @@ from pathlib import Path
 
 from packaging.specifiers import SpecifierSet
 
-from helpers.commands import python
+from helpers.commands import python, write_problem
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "robotdiffuse"
@@ -172,11 +172,7 @@ def test_a_misspelt_name_is_answered_with_a_similar_one_and_commands_need_no_doc
 
 def test_a_plan_by_search_loads_what_it_needs_and_no_more(tmp_path: Path) -> None:
     """Loading further modules would take longer than planning."""
-    problem = tmp_path / "problem.yaml"
-    problem.write_text(
-        "robot: panda\nscene: []\nstart: [0, -0.785, 0, -2.356, 0, 1.571, 0.785]\n"
-        "goal: {joints: [0.5, -0.6, 0.1, -2.2, 0, 1.6, 0.8]}\n"
-    )
+    problem = write_problem(tmp_path, "problem.yaml", scene=[])
     code = (
         "import sys\nfrom robotdiffuse import cli\nfrom robotdiffuse.cli import console\nconsole.SPINNER_DELAY = 600.0\n"
         f"assert cli.main(['plan', {str(problem)!r}, '--planner', 'aorrtc', '--time-limit', '60']) == 0\n"

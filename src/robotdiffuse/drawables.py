@@ -2,7 +2,6 @@
 replays, the live page, recordings for Rerun and Foxglove, and PyBullet's cameras."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -10,8 +9,8 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.transforms import inverse, placed, transform
-from robotdiffuse.core.types import Points, Pose
+from robotdiffuse.core.transforms import inverse, placed, scaled_normals, transform
+from robotdiffuse.core.types import Points, Pose, frozen_dataclass
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual_meshes import load_visual
@@ -36,7 +35,7 @@ MAX_SIZE = 60_000
 """Largest number of points of a cloud, and of faces of a mesh, that are drawn."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Surface:
     """Triangles with a normal and an sRGB color (0 to 1) at each vertex."""
 
@@ -85,7 +84,7 @@ def creased(vertices: Points, faces: Int[ndarray, "f 3"], colors: Float[ndarray,
     duplicated so that each side has a normal of its own. colors: a color per face, 0 to 1."""
     triangles = vertices[faces]
     # normals of the faces: of twice the face's area in length, and of length 1
-    scaled = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    scaled = scaled_normals(triangles)
     unit = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-12)
     # the corners of all faces, sorted by their vertex (`owner`)
     corner = np.argsort(faces.reshape(-1), kind="stable")
@@ -121,7 +120,7 @@ def link_surfaces(robot: Robot) -> dict[str, Surface]:
     }
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Drawable:
     """An obstacle as it is drawn."""
 

@@ -74,10 +74,11 @@ def test_both_versions_and_objects_with_p_and_q(made: Planner) -> None:
 
 
 def test_arguments_of_both_versions(made: Planner) -> None:
-    """Regression: a screw took no arguments of 0.2 and ignored time_step by position; return_closest and None were wrong."""
+    """Regressions: a screw took no arguments of 0.2, and ignored time_step by position; return_closest, None, [] were wrong."""
     for result in (made.plan_screw(POSE, QPOS, 0.1, 0.05), made.plan_screw(target_pose=POSE, qpos=QPOS, time_step=0.05)):
         assert np.allclose(result["time"][:2], [0.05, 0.1])
     assert made.plan_screw(goal_pose=POSE, current_qpos=QPOS, wrt_world=True, verbose=False)["status"] == "Success"
+    assert made.plan_qpos([QPOS], QPOS, fixed_joint_indices=[], constraint_function=None)["status"] == "Success"
     _, closest = made.IK(POSE, QPOS, return_closest=True)
     assert isinstance(closest, np.ndarray) and closest.shape == (9,)
     assert np.array_equal(planner(joint_vel_limits=None, joint_acc_limits=None, srdf=None).joint_vel_limits, np.ones(7))
@@ -113,12 +114,6 @@ def test_obstacles_and_held_objects_count_and_are_removed(made: Planner) -> None
     assert made.remove_point_cloud() and made.detach_object()
 
 
-def test_an_empty_option_has_no_effect(made: Planner) -> None:
-    """Regression: MPlib 0.1's default `fixed_joint_indices=[]` was refused."""
-    assert made.plan_qpos([QPOS], QPOS, fixed_joint_indices=[], constraint_function=None)["status"] == "Success"
-    refuses("unknown option 'fixed_joint_indices'", made.plan_qpos, [QPOS], QPOS, fixed_joint_indices=[0])
-
-
 def test_the_base_stands_in_the_world(made: Planner) -> None:
     made.set_base_pose([0.3, -0.2, 0.7, 1, 0, 0, 0])
     goal = np.array([0.8, 0.0, 1.1, *DOWN])
@@ -134,7 +129,7 @@ def test_failures_say_why(made: Planner) -> None:
     assert made.IK(far, QPOS) == (f"IK Failed! The pose of {HAND} is out of reach", None)
 
 
-def test_bad_input() -> None:
+def test_bad_input(tmp_path: Path) -> None:
     refuses(r"objects must be empty; add obstacles with `planner\.workspace\.add", planner, objects=["box"])
     refuses(r"pose is \[0.5, 0, 0.4\]; it must be x, y, z and a quat", planner().plan_pose, [0.5, 0, 0.4], QPOS)
     refuses("pose is 'here'; it must be x, y, z and a quaternion", planner().plan_pose, "here", QPOS)
@@ -147,6 +142,7 @@ def test_bad_input() -> None:
     for call, goal in ((planner().plan_pose, POSE), (planner().plan_screw, POSE), (planner().plan_qpos, [QPOS])):
         refuses("planning_time is -1; it must be a number from", call, goal, QPOS, planning_time=-1)
     refuses("unknown option 'constraint_function'", planner().plan_qpos, [QPOS], QPOS, constraint_function=print)
+    refuses("unknown option 'fixed_joint_indices'", planner().plan_qpos, [QPOS], QPOS, fixed_joint_indices=[0])
     refuses("time_step is 0; it must be", planner().plan_pose, [0.5, 0, 0.4, *DOWN], QPOS, time_step=0)
     refuses("goal_qposes is .*; it must be rows of 9 numbers", planner().plan_qpos, [QPOS, QPOS[:3]], QPOS)
     refuses("n_init_qpos: .*count is 0; it must be an integer", planner().IK, [0.5, 0, 0.4, *DOWN], QPOS, n_init_qpos=0)
@@ -155,6 +151,8 @@ def test_bad_input() -> None:
     refuses("acceleration limits are .*; they must be 7 positive", planner, joint_acc_limits=[-1.0] * 7)
     refuses("user_joint_names is 'panda_joint1'; it must be a list", planner, user_joint_names="panda_joint1")
     refuses("URDF missing.urdf does not exist", Planner, "missing.urdf", HAND)
+    (tmp_path / "arm.urdf.xacro").write_text("<robot name='arm'><link name='base'/></robot>")
+    refuses("is a xacro file, and compiling it would run code in it", Planner, tmp_path / "arm.urdf.xacro", "base")
     refuses("package_keyword_replacement is 'missing'; it must be a folder", Planner, __file__, HAND, "", "missing")
     for names in (JOINTS[1:], JOINTS[::-1], (*JOINTS, JOINTS[0])):
         refuses(f"user_joint_names is .*; it must name each joint that moves {HAND} once", planner, user_joint_names=names)
@@ -163,13 +161,7 @@ def test_bad_input() -> None:
     refuses("unknown link 'nose'", rd.Workspace, planner().robot, "nose")
 
 
-def test_xacro_is_not_compiled(tmp_path: Path) -> None:
-    file = tmp_path / "arm.urdf.xacro"
-    file.write_text("<robot name='arm'><link name='base'/></robot>")
-    refuses("is a xacro file, and compiling it would run code in it", Planner, file, "base")
-
-
-def test_a_moved_base_keeps_obstacles_held_objects_and_allowed_contacts(made: Planner) -> None:
+def test_a_moved_base_keeps_obstacles_held_objects_and_allowed_contacts_and_a_release_keeps_limits(made: Planner) -> None:
     made.workspace.add(rd.Box([0.5, 0.0, 0.1], [0.2, 0.2, 0.2], name="block"))
     made.workspace.allow("block", [HAND])
     made.update_attached_sphere(0.02, [0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0])
@@ -178,6 +170,9 @@ def test_a_moved_base_keeps_obstacles_held_objects_and_allowed_contacts(made: Pl
     block = made.workspace.scene.shapes[0]
     assert isinstance(block, rd.Box) and np.allclose(block.center, [0.4, 0.0, -0.2])
     assert len(made.workspace.robot.attached) == 1
+    made.joint_vel_limits = np.full(7, 0.1)
+    made.detach_object()
+    assert np.array_equal(made.joint_vel_limits, np.full(7, 0.1))
 
 
 def test_inverse_kinematics_take_poses_in_the_frame_of_the_base(made: Planner) -> None:
@@ -275,13 +270,6 @@ def test_a_line_to_the_edge_of_reach_ends_tilted_with_a_note(made: Planner) -> N
     assert 0.01 < np.arccos(end[2, 2] * far[2, 2]) < np.radians(15)
     far[0, 3] = 1.2
     assert re.search("out of reach|brings", made.plan_screw(far, q)["status"])
-
-
-def test_limits_that_are_set_while_an_object_is_held_remain(made: Planner) -> None:
-    made.update_attached_box([0.03, 0.03, 0.03], [0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0])
-    made.joint_vel_limits = np.full(7, 0.1)
-    made.detach_object()
-    assert np.array_equal(made.joint_vel_limits, np.full(7, 0.1))
 
 
 def test_self_collisions_are_checked_with_the_other_arm_where_qpos_has_it() -> None:

@@ -14,17 +14,14 @@ from robotdiffuse.learning.exported_model import exported_model
 WALL = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.4], name="wall")])
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [controls.ControlSettings(), controls.ControlSettings(source=controls.VIAS, guidance_steps=0)],
-    ids=[controls.NOISE, controls.VIAS],
-)
-def test_a_wall_that_blocks_the_line_is_passed_by_candidates(settings: controls.ControlSettings) -> None:
+@pytest.mark.parametrize("given", [{}, {"source": controls.VIAS, "guidance_steps": 0}], ids=[controls.NOISE, controls.VIAS])
+def test_a_wall_that_blocks_the_line_is_passed_by_candidates(given: dict) -> None:
+    settings = controls.ControlSettings(**given)
     found = controls.Control(settings).plan(rd.Problem(PANDA, WALL, LEFT, rd.JointGoal([RIGHT])), 20.0)
     assert found.solved and found.stage == settings.source
 
 
-def test_vias_are_free_and_on_the_candidates() -> None:
+def test_vias_are_free_and_on_the_candidates_and_for_a_panda_with_all_joints() -> None:
     vias = controls.fixed_vias(PANDA)
     assert vias.shape == (16, 7)
     checker = CollisionChecker(PANDA, rd.Scene())
@@ -34,6 +31,7 @@ def test_vias_are_free_and_on_the_candidates() -> None:
     assert (q[:, 0] == LEFT).all() and (q[:, -1] == RIGHT).all()
     np.testing.assert_array_equal(q[:, q.shape[1] // 2], vias[:3])
     refuses("only the panda", controls.fixed_vias, planar_arm(0.5, 0.4))
+    refuses("only the panda", controls.fixed_vias, rd.load_robot("panda", locked={"panda_joint3": 0.0}))
 
 
 def test_the_nearest_motions_need_data_and_are_bent_to_start_and_goal(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,18 +51,16 @@ def test_the_nearest_motions_need_data_and_are_bent_to_start_and_goal(monkeypatc
     refuses("needs data", controls.ControlSettings, data="of other controls")
 
 
-MIDDLE = 0.5 * (PANDA.lower + PANDA.upper)
-
-
 def test_smooth_noise_has_the_covariance_of_the_pandas_weights_and_keeps_ends_and_limits() -> None:
     rng = np.random.default_rng(1)
-    q = controls.smooth_noise(MIDDLE, MIDDLE[None], 4000, 48, PANDA, rng) - MIDDLE
+    middle = 0.5 * (PANDA.lower + PANDA.upper)
+    q = controls.smooth_noise(middle, middle[None], 4000, 48, PANDA, rng) - middle
     rows = np.moveaxis(q / np.minimum(0.5 * (PANDA.upper - PANDA.lower), controls.MAX_HALF_RANGE), 1, 2).reshape(-1, 48)
     assert abs(rows.std() - controls.SPREAD) < 0.005
     factor = exported_model("model", None, PANDA).statistics.noise_factor.astype(np.float64)
     shares = [np.linalg.eigvalsh(c)[::-1] / np.trace(c) for c in (rows.T @ rows, factor @ factor.T)]
     assert np.abs(shares[0] - shares[1]).max() < 0.012
-    goals = np.stack([MIDDLE, MIDDLE + 0.1]).astype(np.float32)
+    goals = np.stack([middle, middle + 0.1]).astype(np.float32)
     q = controls.smooth_noise(PANDA.lower, goals, 5, 48, PANDA, rng)
     lower, upper = PANDA.lower.astype(np.float32), PANDA.upper.astype(np.float32)
     assert q.dtype == np.float32 and (q[:, 0] == lower).all() and ((q >= lower) & (q <= upper)).all()
@@ -80,7 +76,3 @@ def test_any_goal_is_tried_where_the_nearest_is_blocked() -> None:
     alone = controls.StraightLine(controls.StraightLineSettings(goals=controls.NEAREST_GOAL)).plan(problem, 5.0)
     assert not alone.solved and alone.refused == "scene_collision"
     assert "the straight line is refused" in alone.reason
-
-
-def test_vias_are_for_a_panda_with_all_joints() -> None:
-    refuses("only the panda", controls.fixed_vias, rd.load_robot("panda", locked={"panda_joint3": 0.0}))

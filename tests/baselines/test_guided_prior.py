@@ -6,7 +6,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray
 
 from helpers.panda import LEFT, PANDA, RIGHT
@@ -44,17 +44,10 @@ def bumps(waypoints: int) -> Float[ndarray, "inner inner"]:
 class Gaussian(MotionNetwork):
     """The exact denoiser of straight lines with Gaussian bumps."""
 
-    def denoise(
-        self,
-        features: Float[torch.Tensor, "batch rows features"],
-        level: Float[torch.Tensor, "batch"],
-        condition: Float[torch.Tensor, "batch condition"],
-        dropped: Bool[torch.Tensor, "batch"] | None = None,
-    ) -> Float[torch.Tensor, "batch rows dof"]:
+    def denoise(self, features: torch.Tensor, level: torch.Tensor, condition: torch.Tensor, dropped=None) -> torch.Tensor:
         at = round(float(level[0]) * self.schedule.steps)
         x = features.numpy()
-        signal = float(self.schedule.signal[at])
-        noise = float(self.schedule.noise[at])
+        signal, noise = float(self.schedule.signal[at]), float(self.schedule.noise[at])
         t = np.linspace(0, 1, x.shape[1])[1:-1, None]
         line = (1 - t) * x[:, :1] + t * x[:, -1:]
         total = signal**2 * bumps(x.shape[1]) + noise**2 * np.eye(x.shape[1] - 2)
@@ -219,9 +212,8 @@ def test_each_guide_moves_only_its_rows() -> None:
         assert all(np.array_equal(one, row) for row in moved[shares[i]])
         assert not any(np.array_equal(one, other) for other in first[:i])
     # before any guide begins
-    late = guided_prior.EDMP(
-        guided_prior.EDMPSettings(guides=tuple(replace(guide, guided_share=0.4) for guide in guided_prior.ENSEMBLE))
-    )
+    guides = tuple(replace(guide, guided_share=0.4) for guide in guided_prior.ENSEMBLE)
+    late = guided_prior.EDMP(guided_prior.EDMPSettings(guides=guides))
     assert np.array_equal(late.guided(CHECKER, same[:24], 12), same[:24])
 
 

@@ -127,8 +127,7 @@ def test_the_order_of_the_points_does_not_matter_and_no_points_are_zeros() -> No
 def test_dropout_is_on_in_planning_and_drawn_from_the_generator(weights: str) -> None:
     net = network().eval()
     z = torch.zeros(1, 8)
-    q = torch.from_numpy(LEFT[None].astype(np.float32))
-    goal = torch.from_numpy(RIGHT[None].astype(np.float32))
+    q, goal = (torch.from_numpy(end[None].astype(np.float32)) for end in (LEFT, RIGHT))
     generator = torch.Generator().manual_seed(0)
     first, second = (net.next_states(z, q, goal, generator) for _ in range(2))
     again = net.next_states(z, q, goal, torch.Generator().manual_seed(0))
@@ -158,11 +157,6 @@ def test_hybrid_replanning_joins_what_the_network_does_not(weights: str) -> None
     assert all(result.solved and verify(PROBLEM, result.path).valid for result in results)
     assert any("RRT-Connect" in result.reason for result in results)
     assert np.array_equal(results[0].path.positions, results[-1].path.positions)
-
-
-@pytest.mark.parametrize(("name", "value"), [("layers", ()), ("steady_layers", 12)])
-def test_bad_settings_of_the_network_are_refused(name: str, value: object) -> None:
-    refuses(f"mpnet.{name} is ", replace, MPNetSettings(), **{name: value})
 
 
 RANGES = RobotIdentity.of(PANDA)
@@ -200,9 +194,7 @@ def clouds_of(policy: mpinets.MPiNetsNetwork, count: int, seed: int = 0) -> torc
 @pytest.mark.parametrize("points", [20, 300])
 def test_grouping_is_that_of_brute_force(points: int) -> None:
     cloud = np.random.default_rng(points).normal(size=(3, points, 3)).astype(np.float32)
-    count = 12
-    most = 7
-    radius = 0.8
+    count, most, radius = 12, 7, 0.8
     centers, around = mpinets.group_points(torch.from_numpy(cloud), count, most, radius)
     for x, chosen, near in zip(cloud.astype(np.float64), centers, around, strict=True):
         distance = np.linalg.norm(x[:, None] - x[None], axis=2)
@@ -273,6 +265,8 @@ def test_trained_weights_are_read_and_the_same_seed_gives_the_same_path(tmp_path
 
 
 def test_bad_network_settings() -> None:
+    refuses("mpnet.layers is ", MPNetSettings, layers=())
+    refuses("mpnet.steady_layers is ", MPNetSettings, steady_layers=12)
     made = mpinets.MPiNetsNetworkSettings
     refuses("scene_points is 0", made, scene_points=0)
     refuses("target_points is 13; it must be at most robot_points, 12", made, target_points=13)

@@ -38,15 +38,12 @@ def test_script_runs(script: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "Python 3" in printed, "no head with machine and versions"
 
 
-def test_usages_and_reports_name_their_scripts() -> None:
+def test_usages_and_reports_name_their_scripts_and_the_list_names_all() -> None:
     """The first line of a report names the script that prints it, or says that this is no longer kept."""
     assert not [name for name in SCRIPTS if f"python benchmarks/{name}.py" not in (FOLDER / f"{name}.py").read_text()]
     firsts = {file.name: file.read_text().partition("\n")[0] for file in REPORTS.glob("*.txt")}
     made = (*(f"benchmarks/{name}.py" for name in SCRIPTS), "no longer kept")
     assert not {name: first for name, first in firsts.items() if not any(by in first for by in made)}
-
-
-def test_the_list_names_every_script_and_every_report() -> None:
     listed = (FOLDER / "README.md").read_text()
     assert not [name for name in SCRIPTS if f"`{name}.py`" not in listed]
     names = [file.name for file in REPORTS.iterdir() if file.suffix in (".csv", ".png", ".txt", ".md")]

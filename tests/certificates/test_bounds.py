@@ -76,10 +76,8 @@ def test_distances_are_those_of_coal() -> None:
                 geometry = coal.Cylinder(body.disc, z)
             elif body.rounding:
                 geometry = coal.Capsule(body.rounding, z) if z else coal.Sphere(body.rounding)
-            pieces = [geometry]
-            at = [body.center]
-        R = body.R if isinstance(body, proofs.Rounded) else np.eye(3)
-        less = body.radius if isinstance(body, proofs.Surface) else 0.0
+            pieces, at = [geometry], [body.center]
+        R, less = (body.R, 0.0) if isinstance(body, proofs.Rounded) else (np.eye(3), body.radius)
         for point, distance in zip(points, found[:, k], strict=True):
             ball = coal.Sphere(1e-9)
             place = coal.Transform3s(np.eye(3), point)

@@ -75,24 +75,21 @@ def test_the_checker_loads_neither_compiled_code_nor_coal() -> None:
     assert python(code).stdout == "[]\n[]\n"
 
 
-def micro_steps(time: float) -> tuple[np.ndarray, np.ndarray]:
-    return 1.9e-6 * np.arange(5264.0), np.arange(5264) * time
-
-
+STEPS = np.arange(5264.0)
 # 2 rad in 20 ms, and a row a nanosecond after the last
 SHORT_STEP = np.append(np.linspace(0, 2, 21), 2.0), np.append(np.arange(21) * 1e-3, 0.02 + 1e-9)
 TOO_QUICK = {
-    "one short step": (SHORT_STEP, "mean velocity between rows"),
-    "1e-8 s": (micro_steps(1e-8), "mean velocity from one row to another"),
-    "5e-7 s": (micro_steps(5e-7), "mean velocity from one row to another"),
-    "1e-6 s": (micro_steps(1e-6), "mean acceleration computed from positions"),
+    "one short step": (*SHORT_STEP, "mean velocity between rows"),
+    "1e-8 s": (1.9e-6 * STEPS, STEPS * 1e-8, "mean velocity from one row to another"),
+    "5e-7 s": (1.9e-6 * STEPS, STEPS * 5e-7, "mean velocity from one row to another"),
+    "1e-6 s": (1.9e-6 * STEPS, STEPS * 1e-6, "mean acceleration computed from positions"),
 }
 
 
 @pytest.mark.parametrize("name", TOO_QUICK)
 def test_short_steps_hide_no_rate_from_the_checker(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The validator, which would reject these motions, is patched to accept them."""
-    (place, times), wanted = TOO_QUICK[name]
+    place, times, wanted = TOO_QUICK[name]
     problem, path = problem_of(np.outer(place, [1, 0, 0]))
     still = np.zeros_like(path.positions)
     motion = rd.Trajectory(path.joint_names, times, path.positions, still, still)
@@ -125,16 +122,13 @@ def test_tolerances_are_those_of_the_validator() -> None:
         assert getattr(VerifySettings(), name) == value
 
 
-@pytest.mark.parametrize(
-    ("text", "wanted"),
-    [
+def test_files_that_are_none(tmp_path: FilePath) -> None:
+    file = tmp_path / "c.json"
+    for text, wanted in (
         ("{}", "is not a certificate"),
         ("[1]", "is not a certificate"),
         ('{"is": "robotdiffuse certificate", "version": 9}', "version 9"),
         ('{"is": "robotdiffuse certificate", "version": 1}', "is damaged: KeyError"),
-    ],
-)
-def test_files_that_are_none(tmp_path: FilePath, text: str, wanted: str) -> None:
-    file = tmp_path / "c.json"
-    file.write_text(text)
-    refuses(wanted, rd.load_certificate, file)
+    ):
+        file.write_text(text)
+        refuses(wanted, rd.load_certificate, file)

@@ -22,9 +22,7 @@ from robotdiffuse.trajectories.timing import time_parameterize
 
 pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
 HAND = "panda_hand"
-START = [-0.5, 0.2, 0.0, -2.0, 0.0, 2.2, 0.785]
-MIDDLE = [0.0, 0.2, 0.0, -2.0, 0.0, 2.2, 0.785]
-GOAL = [0.5, 0.2, 0.0, -2.0, 0.0, 2.2, 0.785]
+START, MIDDLE, GOAL = ([turn, 0.2, 0.0, -2.0, 0.0, 2.2, 0.785] for turn in (-0.5, 0.0, 0.5))
 Record = dict[str, Any]
 """The content of a certificate file."""
 
@@ -167,10 +165,7 @@ FORGED: dict[str, tuple[Callable[[Record], object], str]] = {
     "normals turned round": (normals(-1.0), "proof: (clearance|displacement) of "),
     "normals not finite": (normals(float("nan")), "not the normal|NaN|JSON|finite"),
     "planes left out": (of_widest("planes", lambda _: [], True), "proof: (clearance|displacement) of "),
-    "planes of another stretch": (
-        of_widest("planes", lambda planes: [[p[0] + 10**6, *p[1:]] for p in planes], True),
-        "has no stretch",
-    ),
+    "planes of another stretch": (of_widest("planes", lambda x: [[p[0] + 10**6, *p[1:]] for p in x], True), "has no stretch"),
     "planes without their mark": (of_widest("by_planes", lambda _: [], True), "planes are given"),
     # stretches
     "stretches without length": (of_claims(stop=lambda one: one["start"]), "is missing from row"),
@@ -221,10 +216,7 @@ FORGED: dict[str, tuple[Callable[[Record], object], str]] = {
     "a row at rest": (set_to("motion", "velocities", 40, to=[0.0] * 7), "along its cubics"),
     "a bulge between two rows": (bulge, "along its cubics"),
     "two rows": (sparse, "its cubics leave the straight lines"),
-    "a row twice": (
-        lambda record: record["motion"]["positions"].__setitem__(40, record["motion"]["positions"][60]),
-        "exceeds its limit of",
-    ),
+    "a row twice": (lambda x: x["motion"]["positions"].__setitem__(40, x["motion"]["positions"][60]), "exceeds its limit of"),
     "no rates": (without_rates, "nothing about|prove anything about moving"),
     "no stop at the waypoint": (without_stop, "does not stop at waypoints"),
     "another start": (set_to("motion", "positions", 0, 6, to=0.8), "off the start"),

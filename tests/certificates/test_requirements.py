@@ -22,6 +22,9 @@ from robotdiffuse.robots.dynamics import Dynamics
 HAND = "panda_hand"
 START = [-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
 GOAL = [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
+LOW = [-0.6, 0.2, 0, -1.2, 0, 2.2, 0.2]
+FAR = [0.6, 0.6, 0, -1.0, 0, 2.2, 0.2]
+PAYLOAD = rd.Payload(1.5, [0.05, 0.0, 0.1], None, [0.01, 0.02, 0.03])
 TABLE = rd.Box([0.55, 0.0, 0.0], [0.5, 1.0, 0.2], name="table")
 ACROSS = rd.MovingObstacle(rd.Cylinder([0.42, 0.35, 0.4], 0.06, 0.6, name="post"), velocity=[0.25, -0.1, 0.0])
 ASKED: dict[str, dict[str, Any]] = {
@@ -128,11 +131,6 @@ def test_paths_with_constraints_are_certified_and_with_moving_obstacles_refused(
         rd.certify(replace(problem, constraints=(), moving=[ACROSS]), path)
 
 
-LOW = [-0.6, 0.2, 0, -1.2, 0, 2.2, 0.2]
-FAR = [0.6, 0.6, 0, -1.0, 0, 2.2, 0.2]
-PAYLOAD = rd.Payload(1.5, [0.05, 0.0, 0.1], None, [0.01, 0.02, 0.03])
-
-
 @cache
 def loaded_motion() -> tuple[rd.Problem, rd.Certificate]:
     """A certified motion at the torque limit of a joint."""
@@ -207,10 +205,6 @@ def test_a_peak_between_rows_needs_samples() -> None:
 
 def test_another_payload_needs_another_proof() -> None:
     problem, certificate = loaded_motion()
-    for payload, wanted in (
-        (rd.Payload(3.5, [0.0, 0.0, 0.1]), "panda_joint2 is not shown to keep its limit"),
-        (None, "torques: the problem has no payload"),
-    ):
-        other = replace(problem, payload=payload)
-        found = replace(certificate, request_parts=request_parts(other)).check(other).differences
-        assert any(wanted in line for line in found), found
+    heavier = replace(problem, payload=rd.Payload(3.5, [0.0, 0.0, 0.1]))
+    refused(certificate, heavier, "panda_joint2 is not shown to keep its limit")
+    refused(certificate, replace(problem, payload=None), "torques: the problem has no payload")

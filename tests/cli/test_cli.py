@@ -58,9 +58,7 @@ BAD_CALL = {
     "ending of a replay": (["explore", "problem.json", "--out", "seen.gif"], ".html, .png"),
     "ending of a recording": (["explore", "problem.json", "--record", "seen.bag"], ".mcap"),
     "unknown policy": (["explore", "problem.json", "--policy", "bold"], "unknown explorer.policy"),
-    "policies that exclude each other": (
-        ["explore", "problem.json", "--policy", "probabilistic", "--see-goal"], "see_goal needs policy 'strict'"
-    ),
+    "two policies": (["explore", "problem.json", "--policy", "probabilistic", "--see-goal"], "see_goal needs policy 'strict'"),
     "files of a live page": (["explore", "problem.json", "--live", "--view"], "--live writes no files"),
     "speed of no page": (["explore", "problem.json", "--speed", "2"], "add --live"),
     "two demos": (["demo", "--explore", "--camera"], ""),

@@ -22,23 +22,19 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     return commands
 
 
-def test_the_first_compilation_starts_one_process(started: list[list[str]]) -> None:
+def test_only_the_first_compilation_starts_a_process_and_none_a_warm_start_or_a_single_core(started, monkeypatch) -> None:
     with compiling_ahead(picture=True):
         assert started == []
         loading.compiles("one")
         loading.compiles("two")
     loading.compiles("three")
-    assert started == [[sys.executable, "-m", "robotdiffuse.cli.compile_ahead", "picture"]]
-
-
-def test_a_warm_start_or_a_single_core_starts_none(started: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
     with compiling_ahead(picture=False):
         pass
     loading.compiles("after the block")
     monkeypatch.setattr("os.cpu_count", lambda: 1)
     with compiling_ahead(picture=False):
         loading.compiles("on one core")
-    assert started == []
+    assert started == [[sys.executable, "-m", "robotdiffuse.cli.compile_ahead", "picture"]]
 
 
 def test_it_compiles_what_a_plan_calls() -> None:

@@ -56,10 +56,8 @@ def test_elsewhere_no_browser_gets_data_without_the_token() -> None:
         assert printed is not None
         url = f"ws://127.0.0.1:{printed[1]}/"
         token = printed[2]
-        assert hears(url, token)
-        assert not hears(url)
-        assert not hears(url, token[:-1])
-        assert not hears(url, token, Origin="http://evil.example")
+        heard = [hears(url, token), hears(url), hears(url, token[:-1]), hears(url, token, Origin="http://evil.example")]
+        assert heard == [True, False, False, False]
     finally:
         server.send_signal(signal.SIGTERM)
         assert server.wait(timeout=300) == 143

@@ -183,14 +183,12 @@ def test_plan_and_verify_name_allowed_contacts(tmp_path: Path, said: Said) -> No
     assert note in said(0, "certificate", "check", "c.json")
 
 
-NEAR = {"joints": [-0.95, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]}
-
-
 def test_explore_writes_files(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("robotdiffuse.visualization.exploration.TILE", PictureSettings(width=240, height=150, ghosts=1))
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    status = run("explore", write_problem(tmp_path, goal=NEAR), "--out", "seen.png", "--record", "seen.mcap", "--view")
+    near = write_problem(tmp_path, goal={"joints": [-0.95, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]})
+    status = run("explore", near, "--out", "seen.png", "--record", "seen.mcap", "--view")
     printed = capsys.readouterr().out
     assert status in (0, 1) and printed.startswith("1. ") and "of the map" in printed
     assert (status == 0) == ("done: the arm is at the goal" in printed)

@@ -15,7 +15,7 @@ from robotdiffuse.cli import train as train_command
 from robotdiffuse.cli.train import data_settings, train_for_robot
 from robotdiffuse.generation import factory
 from robotdiffuse.learning.denoisers import PAPER_SIZES, TransformerSettings
-from robotdiffuse.learning.training.config import CONFIGS, PlannerTraining, planner_training
+from robotdiffuse.learning.training.config import CONFIGS, PlannerTraining
 from robotdiffuse.learning.weight_files import user_weights, weights_for
 from robotdiffuse.planning.diffusion import Diffusion
 
@@ -26,7 +26,6 @@ TRAIN = ["train", "planner", "--data", "d", "--encoder", "dgcnn", "--out", "o"]
 def trained(monkeypatch: pytest.MonkeyPatch) -> list[PlannerTraining]:
     """Records the settings of requested trainings instead of training."""
     trained: list[PlannerTraining] = []
-
     monkeypatch.setattr(train_command, "train_planner", lambda settings, out: trained.append(settings) or {})
     return trained
 
@@ -43,8 +42,7 @@ def test_unknown_configs_and_those_without_their_encoder_are_refused(said: Said)
 
 def test_parts_replace_those_of_the_config(trained: list[PlannerTraining]) -> None:
     parts = ["--objective", "noise", "--sampler", "ddim", "--waypoints", "64", "--condition-drop", "0.2"]
-    parts += ["--target", "residual"]
-    assert run(*TRAIN, "--config", "paper", "--denoiser", "unet", *parts, "--device", "cpu") == 0
+    assert run(*TRAIN, "--config", "paper", "--denoiser", "unet", *parts, "--target", "residual", "--device", "cpu") == 0
     assert run(*TRAIN, "--config", "paper") == 0
     assert run(*TRAIN, "--config", "table2_unet", "--denoiser", "decoder_only") == 0
     changed, paper, row = trained
@@ -93,7 +91,7 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_arm_of_five_joints_plans_with_its_trained_network(tmp_path: Path) -> None:
     robot = rd.load_robot("so101")
     assert weights_for("model", robot) is None
-    report, kept = train_for_robot("so101", TINY, partial(planner_training, "compact"), None, motions=12)
+    report, kept = train_for_robot("so101", TINY, "compact", None, motions=12)
     assert report["samples"] == TINY["samples"] and kept == weights_for("model", robot)
     assert kept == tmp_path / "robots" / "so101" / "weights"
     planner = Diffusion()

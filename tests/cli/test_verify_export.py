@@ -64,8 +64,7 @@ def test_all_violations_are_listed(planned: Path, said: Said) -> None:
     assert first.count("not valid") == 1 and "inside new" in first
     assert not Path("c.json").exists()
     every = said(1, *asked, "--all").splitlines()
-    assert len(every) > 1
-    assert all("new" in line for line in every)
+    assert len(every) > 1 and all("new" in line for line in every)
     times = [float(line.rpartition("(at ")[2].rstrip(")")) for line in every]
     assert times == sorted(times)
 

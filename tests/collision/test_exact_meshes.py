@@ -55,7 +55,7 @@ def test_links_without_meshes_are_their_spheres() -> None:
 
 def test_pairs_of_links() -> None:
     exact = ExactCollision(box_arm(), rd.Scene())
-    assert exact.pairs == (("l1", "l3"),)
+    assert [check for check in exact.checks if check.other] == [("l1", "l3")]
     (folded,) = exact.pair_distances(np.array([0.3, np.pi / 2, 0]))
     assert folded.distance == pytest.approx(0.4 - HALF_WIDTH, abs=1e-6)
     (crossing,) = exact.pair_distances(np.array([1.0, 2.6, 2.6]))
@@ -150,7 +150,8 @@ def test_collisions_are_explained() -> None:
 
 def test_fixed_links_do_not_count_against_the_scene() -> None:
     exact = ExactCollision(box_arm().with_locked({"j0": 0.0}), rd.Scene([rd.Sphere((0.2, 0, 0), 0.1)]))
-    assert exact.links == ("l2", "l3") and not exact.collides(np.zeros((1, 2)))[0]
+    assert [check.link for check in exact.checks if check.other is None] == ["l2", "l3"]
+    assert not exact.collides(np.zeros((1, 2)))[0]
 
 
 TURN = 0.6

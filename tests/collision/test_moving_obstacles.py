@@ -153,16 +153,14 @@ def test_files_hold_every_motion(tmp_path: Path, base: np.ndarray | None) -> Non
                 assert np.allclose(one.pose(time), other.pose(time), atol=1e-9)
 
 
-SPHERE = {"sphere": {"center": [0, 0, 1], "radius": 0.1}}
-
-
 def test_files_name_the_field() -> None:
     record = problem_record(rd.Problem(PANDA, rd.Scene(), START, END))
+    sphere = {"sphere": {"center": [0, 0, 1], "radius": 0.1}}
     for entry, message in (
         ({}, r"moving is .*; it must be a list"),
         ([3], r"moving\[0\] is 3; it must be a shape and its motion"),
-        ([SPHERE | {"speed": 1}], r"moving\[0\] has the fields .* max_speed"),
-        ([SPHERE], r"moving\[0\]: .* has no motion"),
+        ([sphere | {"speed": 1}], r"moving\[0\] has the fields .* max_speed"),
+        ([sphere], r"moving\[0\]: .* has no motion"),
         ([{"sphere": {"center": [0, 0, 1], "radius": -1}, "max_speed": 1}], r"moving\[0\].*radius"),
     ):
         refuses(message, problem_from_record, record | {"moving": entry})

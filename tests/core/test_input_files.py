@@ -46,8 +46,7 @@ NAMED = {
 
 def one_line(call: Callable[[], object]) -> str:
     message = refuses(".", call)
-    assert message.isprintable()
-    assert len(message) < 500
+    assert message.isprintable() and len(message) < 500
     return message
 
 
@@ -172,8 +171,7 @@ def test_a_broken_mesh_and_one_that_asks_for_memory_are_one_line(tmp_path: Path,
 
 def test_messages_quote_sixty_characters() -> None:
     for value in ("x" * 10**6, [1] * 10**6, 10**5000, np.zeros(10**6), "\x1b[31m\n\ud800", {"a": "b" * 100}):
-        assert len(shown(value)) <= 60
-        assert shown(value).isprintable()
+        assert len(shown(value)) <= 60 and shown(value).isprintable()
     assert shown([np.float64(0.5), (np.int32(-2), np.float32(np.inf))]) == "[0.5, (-2, inf)]"
     inside: list[object] = []
     for _ in range(10**5):
@@ -223,9 +221,7 @@ def test_nothing_unpickles_files() -> None:
     assert list(SOURCE.rglob("*.py"))
     for file in SOURCE.rglob("*.py"):
         text = file.read_text()
-        if file.parent.name == "processes":
-            continue
-        if not re.search(r"\b(pickle|dill|joblib|shelve|marshal|load)\b", text):
+        if file.parent.name == "processes" or not re.search(r"\b(pickle|dill|joblib|shelve|marshal|load)\b", text):
             continue
         for node in ast.walk(ast.parse(text)):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
@@ -245,9 +241,6 @@ def test_different_numbers_are_told_apart_by_few_digits(values: list[float], dig
     assert (distinct(3.14, 9.0), distinct(3.1400001049, 3.14)) == (["3.14", "9"], ["3.1400001", "3.14"])
 
 
-COUNT = 2000
-
-
 class Name(str):
     """A text that counts how often it is compared."""
 
@@ -262,11 +255,12 @@ class Name(str):
 
 def test_names_are_compared_a_few_times_each(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Name, "compared", 0)
-    names = [Name(f"j{i}") for i in range(COUNT)]
+    count = 2000
+    names = [Name(f"j{i}") for i in range(count)]
     refuses("joint_names has j7 more than once", check_motion_arrays, [*names, Name("j7")], {"positions": [[0.0]]})
     few = names[:MAX_CONTACT_LINKS]
     scene = Scene([Box([1, 0, 0], [0.1, 0.1, 0.1])], [("box", [name]) for name in few])
-    assert Name.compared < 5 * COUNT
+    assert Name.compared < 5 * count
     assert scene.allowed_contacts == (("box", tuple(few)),)
     refuses(f"'box' has over {MAX_CONTACT_LINKS} links; write 'all'", Scene, scene.shapes, [("box", names)])
 
@@ -307,15 +301,11 @@ def test_collada_is_read_in_meters(tmp_path: Path) -> None:
     refuses("its unit is '0' m", read_triangles, collada(tmp_path, "0"))
 
 
-@pytest.mark.parametrize(
-    ("up", "expected"),
-    [
-        ("Z_UP", [[1, 0, 0], [0, 2, 0], [0, 0, 3]]),
-        ("Y_UP", [[1, 0, 0], [0, 0, 2], [0, -3, 0]]),
-        ("X_UP", [[0, 0, 1], [-2, 0, 0], [0, -3, 0]]),
-        ("glTF", [[1, 0, 0], [0, 0, 2], [0, -3, 0]]),
-    ],
-)
+Y_UP = [[1, 0, 0], [0, 0, 2], [0, -3, 0]]
+TURNED = {"Z_UP": [[1, 0, 0], [0, 2, 0], [0, 0, 3]], "Y_UP": Y_UP, "X_UP": [[0, 0, 1], [-2, 0, 0], [0, -3, 0]], "glTF": Y_UP}
+
+
+@pytest.mark.parametrize(("up", "expected"), TURNED.items())
 def test_the_up_axis_becomes_z_but_not_of_links(up: str, expected: list[list[int]], tmp_path: Path) -> None:
     """Regressions: a wall in glTF lay flat; links of PR2, TIAGo and Kinova's Jaco were turned, unlike in Coal and RViz."""
     trimesh.Trimesh(np.diag([1, 2, 3]), [[0, 1, 2]]).export(tmp_path / "part.glb")

@@ -175,8 +175,7 @@ def smooth(legs: int = 1, rate: float = 40.0) -> Trajectory:
     v = 30 * u**2 * (1 - u) ** 2 * far
     a = 60 * u * (1 - u) * (1 - 2 * u) * far
     shift = [(1.5 * k + u[:, 0], q + k * far) for k in range(legs)]
-    times = np.concatenate([s[0] for s in shift])
-    positions = np.concatenate([s[1] for s in shift])
+    times, positions = (np.concatenate(of) for of in zip(*shift, strict=True))
     return Trajectory(("a", "b", "c"), times, positions, np.tile(v, (legs, 1)), np.tile(a, (legs, 1)))
 
 
@@ -242,6 +241,15 @@ def test_short_motions_stay_valid_when_resampled(size, rate):
     assert verify(problem, motion).valid
     report = verify(problem, motion.resample(rate))
     assert report.valid, report.violation
+
+
+@pytest.mark.parametrize("rate", [10, 20, 125, 250, 1000])
+def test_rows_at_a_constant_rate_keep_the_stops(rate: int) -> None:
+    """Regression: a motion that stops at waypoints was valid at no rate, so it could not be exported."""
+    ways = [[0.2, 0.1, 0.3], [0.1, 0.2, 0.1]]
+    problem = Problem(box_arm(), Scene(), [0.1, 0.2, 0.3], [0.3, 0.2, 0.1], waypoints=ways)
+    motion = load_planner("straight_line").plan(problem).trajectory.resample(rate)
+    assert len(motion.stops) == 2 and verify(problem, motion).valid
 
 
 def test_a_trajectory_of_one_row_rests_there():

@@ -89,7 +89,6 @@ def test_assignments_and_those_that_are_wrong() -> None:
     changed = Search().changed(["step=1e-3", "inner.cells=5", "greedy=true", "range=none", "order=best"])
     assert changed == Search(step=0.001, inner=Coarse(5), greedy=True, range=None, order="best")
     assert Search().changed(["levels=[1, 2]"]).levels == (1.0, 2.0)
-
     refuses("search has no setting 'reach'; it has step=1.0, .*range=none, .*inner.cells=3", Search().changed, ["reach=1"])
     refuses("'step' is not NAME=VALUE", Search().changed, ["step"])
     refuses("search.step is 'big'; it takes a number above 0", Search().changed, ["step=big"])

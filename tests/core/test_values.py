@@ -272,12 +272,8 @@ def arrays(value: object, name: str = "") -> Iterator[tuple[str, ndarray]]:
 
 
 def test_every_kind_of_value_is_tried() -> None:
-    public = [getattr(rd, name) for name in dir(rd)]
-    with_arrays = {
-        kind
-        for kind in public
-        if isinstance(kind, type) and is_dataclass(kind) and any("Float" in str(f.type) for f in fields(kind))
-    }
+    public = [kind for kind in (getattr(rd, name) for name in dir(rd)) if isinstance(kind, type) and is_dataclass(kind)]
+    with_arrays = {kind for kind in public if any("Float" in str(f.type) for f in fields(kind))}
     assert {*kinds()} - {FrameConstraint} | {SeenPoints, AssumedPoints} == {*VALUES}
     assert with_arrays - {*VALUES} == {rd.Certificate}  # nothing is kept of one: each check begins anew
 

@@ -148,7 +148,7 @@ def test_bad_input(store, tmp_path):
         refuses(message, RopDataset, tmp_path)
 
 
-def test_turned_motions_have_the_same_clearances():
+def test_turned_motions_have_the_same_clearances_and_one_that_uses_the_whole_range_of_the_first_joint_stays():
     rng = np.random.default_rng(3)
     packed = PackedScenes.pack([ROP_DENSE.scene(rng) for _ in range(6)], ROP_DENSE.max_obstacles, floor=True)
     start, goal = rng.uniform(PANDA.lower, PANDA.upper, (2, 6, PANDA.dof))
@@ -162,9 +162,6 @@ def test_turned_motions_have_the_same_clearances():
         after = CollisionChecker(PANDA, packed_turned.scene(i)).link_clearances(q_turned[i])
         np.testing.assert_allclose(after, CollisionChecker(PANDA, packed.scene(i)).link_clearances(q[i]), atol=2e-5)
         assert clear[i] == CollisionChecker(PANDA, rd.Scene([])).free(q_turned[i]).all()
-
-
-def test_a_motion_that_uses_the_whole_range_of_the_first_joint_stays():
     q = np.linspace(PANDA.lower, PANDA.upper, 5)[None].astype(np.float32)
     same, _, _ = shards.turned(PANDA, q, PackedScenes.pack([rd.Scene([])], 1), np.random.default_rng(0))
     np.testing.assert_allclose(same, q, atol=1e-6)

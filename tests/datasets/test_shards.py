@@ -242,8 +242,6 @@ def test_a_pipe_in_a_data_set_is_not_waited_for(tmp_path, arrays, name):
     shards.write_shard(tmp_path, 0, arrays, {})
     (tmp_path / name).unlink(missing_ok=True)
     os.mkfifo(tmp_path / name)
-    read = {
-        "manifest.json": lambda: shards.read_manifest(tmp_path),
-        "robot.npz": lambda: import_npz(tmp_path / name, tmp_path / "set"),
-    }
+    out = tmp_path / "set"
+    read = {"manifest.json": lambda: shards.read_manifest(tmp_path), "robot.npz": lambda: import_npz(tmp_path / name, out)}
     refuses(f"{name} cannot be read: it is a device or a pipe", read.get(name, lambda: shards.read_shard(tmp_path, 0)))

@@ -102,9 +102,6 @@ def script(page: Path) -> str:
     return "\n".join(b.code for b in blocks if "file" not in b.marks and b.marks.get("test") != "parse")
 
 
-TABLES: tuple[dict[str, Any], ...] = (*(PLANNERS, FAMILIES, METRICS, SHAPES), *(DENOISERS, ENCODERS, SAMPLERS))
-
-
 @pytest.fixture(scope="module")
 def names(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     """The names that the page's Python defines, while its entries are in the tables."""
@@ -113,7 +110,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     with pytest.MonkeyPatch.context() as patch, ExitStack() as as_before:
         patch.chdir(folder)
         patch.syspath_prepend(folder)
-        for table in (*TABLES, sys.modules):
+        for table in (PLANNERS, FAMILIES, METRICS, SHAPES, DENOISERS, ENCODERS, SAMPLERS, sys.modules):
             as_before.enter_context(mock.patch.dict(table))
         for block in code_blocks(ROOT / "docs" / "extending.md"):
             notebook.try_block(block)

@@ -25,6 +25,8 @@ ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 SLOW = {"01_own_robot", "05_depth_camera", "09_two_arms", "12_train_on_own_data", "13_mujoco"}
 """They prepare a robot, load networks, compile the code for several arms, or train."""
+NAMES = sorted(getattr(rd, "__all__"))  # noqa: B009  (the stub does not name it)
+MODULES = re.findall(r"^::: robotdiffuse\.(.+)$", (ROOT / "docs" / "reference" / "modules.md").read_text("utf-8"), re.MULTILINE)
 
 
 @pytest.mark.usefixtures("small_pictures")
@@ -49,10 +51,6 @@ def test_the_gallery_has_thirteen_examples_and_the_first_motion_keeps_its_cleara
         assert (ROOT / "docs" / "images" / "gallery" / f"{file.stem}.png").is_file(), file.name
     assert "plan examples/ball.yaml --until first" in (ROOT / "README.md").read_text()
     assert rd.plan(rd.Problem.load(ROOT / "examples" / "ball.yaml"), until="first").scene_clearance >= 0.01
-
-
-NAMES = sorted(getattr(rd, "__all__"))  # noqa: B009  (the stub does not name it)
-MODULES = re.findall(r"^::: robotdiffuse\.(.+)$", (ROOT / "docs" / "reference" / "modules.md").read_text("utf-8"), re.MULTILINE)
 
 
 def public(name: str) -> Any:

@@ -22,16 +22,7 @@ from robotdiffuse.core import registry
 from robotdiffuse.evaluation import bench
 from robotdiffuse.evaluation.bench_comparisons import LATE_SECONDS
 from robotdiffuse.evaluation.metrics import METRICS
-from robotdiffuse.evaluation.runs import (
-    Record,
-    RecordFile,
-    Run,
-    gather_cases,
-    problem_set_name,
-    read_records,
-    record_path,
-    validator,
-)
+from robotdiffuse.evaluation.runs import Record, RecordFile, Run, gather_cases, problem_set_name, read_records, validator
 from robotdiffuse.learning.weight_files import BUNDLED
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.planning.diffusion import Diffusion
@@ -307,9 +298,8 @@ def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch:
     refuses("has records of mpnet@best with other weights than those in", bench.run_bench, other, quiet, quiet)
 
 
-@pytest.mark.parametrize(
-    ("change", "match"),
-    [
+def test_bad_settings_are_told_before_anything_is_made(tmp_path: Path) -> None:
+    for change, match in (
         ({"planners": ("rrt",)}, "unknown planner 'rrt'; known:"),
         ({"planners": ("rrt_connect", "rrt_connect")}, "the same name"),
         ({"planners": ("rrt_connect@.",)}, "rrt_connect has no weights"),
@@ -320,10 +310,8 @@ def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch:
         ({"problems": ("ropp",)}, "neither a file or folder nor a family"),
         ({"count": 0}, "count is 0"),
         ({"cluster": "slurm"}, "known: ray"),
-    ],
-)
-def test_bad_settings_are_told_before_anything_is_made(tmp_path: Path, change: dict, match: str) -> None:
-    refuses(match, lambda: bench.run_bench(replace(settings(tmp_path / "out"), **change), quiet, quiet))
+    ):
+        refuses(match, lambda change=change: bench.run_bench(replace(settings(tmp_path / "out"), **change), quiet, quiet))
     assert not (tmp_path / "out" / "records").exists()
 
 
@@ -340,7 +328,7 @@ def test_planners_and_problems_of_presets_are_known(name: str, tmp_path: Path) -
 
 @pytest.mark.slow
 def test_the_command_runs_every_stage_of_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    preset = bench.Preset("for tests", ("rrt_connect",), ("rop",), (0.001, 0.5), 5, equal_time=False)
+    preset = bench.Preset(("rrt_connect",), ("rop",), (0.001, 0.5), 5, equal_time=False)
     monkeypatch.setitem(bench.PRESETS, "small", preset)
     assert main(["bench", "run", "--preset", "small", "--count", "2", "--out", str(tmp_path)]) == 0
     found = read_records(tmp_path)
@@ -370,7 +358,7 @@ def test_motions_are_looked_at_again(tmp_path: Path, said: Said) -> None:
         replace(about, planner="bad", positions=tuple(map(tuple, line))),
         replace(about, planner="none", status="timeout"),
     ):
-        RecordFile(record_path(tmp_path, record.planner)).append(record)
+        RecordFile(tmp_path / "records" / f"{record.planner}.jsonl").append(record)
     lines = said(1, "bench", "confirm", tmp_path).splitlines()
     rows = {line.split()[0]: line.split()[1:] for line in lines[1:4]}
     assert rows == {"bad": ["1", "1"], "good": ["1", "0"], "none": ["0", "0"]}

@@ -68,11 +68,10 @@ def keep_problems(folder: Path, names: list[str]) -> None:
 @pytest.fixture
 def small(tmp_path: Path) -> Path:
     names = ["rop/0", "rop/1", "rop/2", "rop/3"]
-    trivial = [False, False, False, True]
-    records = [solved("robotdiffuse", n, 1.0, [(0.05, 2.0)], trivial=t) for n, t in zip(names, trivial, strict=True)]
+    records = [solved("robotdiffuse", name, 1.0, [(0.05, 2.0)], trivial=name == "rop/3") for name in names]
     # the first path after 0.05, 0.5 and 5 s; the last problem beyond the limit of 10 s
-    for name, t, first in zip(names[:3], trivial, (0.05, 0.5, 5.0), strict=False):
-        records.append(solved("ompl_rrt_star", name, 10.0, [(first, 4.0), (first * 1.5, 3.0)], time=10.0, trivial=t))
+    for name, first in zip(names[:3], (0.05, 0.5, 5.0), strict=True):
+        records.append(solved("ompl_rrt_star", name, 10.0, [(first, 4.0), (first * 1.5, 3.0)], time=10.0))
     records.append(failed("ompl_rrt_star", names[3], 10.0, 10.0, trivial=True))
     records += [
         solved("mpnet", names[0], 1.0, [(0.02, 2.4)]),
@@ -121,8 +120,7 @@ def test_figures_of_a_small_run(small: Path) -> None:
     whole, apart = bench_comparisons.sections(bench)
     assert (whole.name, apart.name) == ("rop", "rop, non-trivial")
     assert [c.limit for c in whole.comparisons] == [0.1, 1.0, 10.0]
-    assert [c.problems for c in whole.comparisons] == [4, 4, 4]
-    assert [c.problems for c in apart.comparisons] == [3, 3, 3]
+    assert [[c.problems for c in of.comparisons] for of in (whole, apart)] == [[4, 4, 4], [3, 3, 3]]
     star = [rows(whole, t)["ompl_rrt_star"] for t in (0.1, 1.0, 10.0)]
     assert [row.figures.success for row in star] == [25, 50, 75]
     assert star[0].figures.length == 9.0  # improved by 0.075 s
@@ -138,12 +136,10 @@ def test_figures_of_a_small_run(small: Path) -> None:
     assert net.paired.ratio == pytest.approx(1.1)  # of 1.2 and 1
     assert net.figures.length == pytest.approx(3 * 2.2)
     assert rows(whole, 10.0)["mpnet"].figures.success == 50  # it ended by itself
-    lengths = {"robotdiffuse": 6.0, "mpnet": 6.6, "ompl_rrt_star": 9.0}
-    times = {"robotdiffuse": 0.05, "mpnet": 0.51, "ompl_rrt_star": 1.0}
-    for name, success, collision in (("robotdiffuse", 1, 1), ("mpnet", 0, 0), ("ompl_rrt_star", 0, 1)):
-        length = (9.0 - lengths[name]) / 3.0
-        time = (1.0 - times[name]) / 0.95
-        assert rows(whole, 1.0)[name].comscore == pytest.approx((success + collision + length + time) / 4)
+    figures = {"robotdiffuse": (1, 1, 6.0, 0.05), "mpnet": (0, 0, 6.6, 0.51), "ompl_rrt_star": (0, 1, 9.0, 1.0)}
+    for name, (success, collision, length, time) in figures.items():
+        score = (success + collision + (9.0 - length) / 3.0 + (1.0 - time) / 0.95) / 4
+        assert rows(whole, 1.0)[name].comscore == pytest.approx(score)
 
 
 def test_compared_are_problems_that_all_planners_were_given_this_time_for(tmp_path: Path) -> None:
@@ -207,8 +203,7 @@ def cells(table: Table, heading: str) -> dict[str, str]:
 def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
     """Planners that end early are restarted, in rows of their own; planners that use up the limit are not."""
     records = []
-    for i in range(3):
-        name = f"rop/{i}"
+    for name in ("rop/0", "rop/1", "rop/2"):
         records += [
             solved("robotdiffuse", name, 1.0, [(0.05, 2.0)]),
             solved("robotdiffuse" + RESTARTED, name, 1.0, [(0.05, 2.0), (0.6, 1.6)], 0.99, restarts=19),
@@ -251,9 +246,8 @@ def test_rows_that_were_timed_under_other_loads_are_told_in_the_table(tmp_path: 
     bench = bench_comparisons.read_bench(folder)
     (section,) = bench_comparisons.sections(bench, [1.0])
     table = bench_report.main_table(section, section.main, bench.reference)
-    assert cells(table, "timed") == dict.fromkeys(("robotdiffuse", "rrt_connect"), "run a, 2 at once") | {
-        "mpd": "run b, 1 at once"
-    }
+    timed = dict.fromkeys(("robotdiffuse", "rrt_connect"), "run a, 2 at once") | {"mpd": "run b, 1 at once"}
+    assert cells(table, "timed") == timed
     assert "Not all rows were timed alike" in table.notes[0]
     bench = bench_comparisons.read_bench(folder, ["robotdiffuse", "rrt_connect"])
     (section,) = bench_comparisons.sections(bench, [1.0])
@@ -275,9 +269,7 @@ def test_a_metric_is_declared_in_one_place(small, tmp_path, monkeypatch):
     bench = bench_comparisons.read_bench(write(tmp_path / "run", [record]))
     report = bench_report.bench_report(bench, bench_comparisons.sections(bench, [1.0]))
     assert re.search(r"waypoint count kilo .*\n.*\n.* 0.0030 ", report.markdown)
-    page = report.page
-    assert re.search(r"<th[^>]*>waypoint count kilo</th>", page)
-    assert re.search(r"<td[^>]*>0.0030</td>", page)
+    assert re.search(r"<th[^>]*>waypoint count kilo</th>", report.page) and re.search(r"<td[^>]*>0.0030</td>", report.page)
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """Metrics on motions with known values, each criterion of success, statistics, and ComScore."""
 
-from dataclasses import replace
 from math import comb
 
 import numpy as np
@@ -53,8 +52,7 @@ def test_lengths_of_an_arm_of_two_links(rows, joint, link, tip, turned):
 def test_bending_of_a_sine_by_hand() -> None:
     """q = (u, a sin(pi k u)), in units of the path's length; since the amplitude is small, the speed is nearly constant."""
     u = np.linspace(0, 1, 4001)
-    a = 0.003
-    k = 3
+    a, k = 0.003, 3
     q = np.stack([u, a * np.sin(np.pi * k * u)], axis=1)
     assert metrics.bending(q) == pytest.approx((a * (np.pi * k) ** 2) ** 2 / 2, rel=0.01)
     assert metrics.bending(5 * q) == pytest.approx(metrics.bending(q))
@@ -149,8 +147,7 @@ def test_intervals_are_wilsons_and_have_the_normal_width() -> None:
 
 
 def test_paired_success_is_the_exact_test_of_mcnemar() -> None:
-    a = np.full(100, np.nan)
-    b = np.full(100, np.nan)
+    a, b = np.full((2, 100), np.nan)
     a[:80] = b[:80] = 2.0
     b[80:85] = a[85:97] = 2.0
     found = bench_comparisons.compare(a, b)
@@ -200,7 +197,7 @@ def test_comscore_of_the_papers_table() -> None:
 def test_where_all_are_equal_all_are_best() -> None:
     same = bench_comparisons.Indicators(90.0, 0.0, 5.0, 1.0)
     np.testing.assert_array_equal(bench_comparisons.comscores([same, same]), [1.0, 1.0])
-    np.testing.assert_array_equal(bench_comparisons.comscores([same, replace(same, length=6.0)]), [1.0, 0.75])
+    np.testing.assert_array_equal(bench_comparisons.comscores([same, same._replace(length=6.0)]), [1.0, 0.75])
     assert bench_comparisons.comscores([]).shape == (0,)
     # unknown figures count as the worst
     nothing = bench_comparisons.Indicators(0.0, 0.0, np.nan, 10.0)

@@ -77,11 +77,8 @@ def test_the_row_of_weights_says_what_they_are(parts: dict[str, Any], name: str,
 
 @pytest.mark.slow
 def test_a_small_page_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    lines = (
-        paper.Row(paper.ROWS[4].name, "straight_line", paper.PAPER_METHOD),
-        paper.Row("nearest", "straight_line:goals=nearest"),
-    )
-    monkeypatch.setattr(paper, "ROWS", lines)
+    ours = paper.Row(paper.ROWS[4].name, "straight_line", paper.PAPER_METHOD)
+    monkeypatch.setattr(paper, "ROWS", (ours, paper.Row("nearest", "straight_line:goals=nearest")))
     command = ["reproduce", "table1", "--out", str(tmp_path), "--problems", "3", "--time-limit", "2"]
     assert main(command) == 0 and main(command) == 0
     assert [len(records) for records in read_records(tmp_path).values()] == [6, 6]
@@ -93,8 +90,7 @@ def test_a_small_page_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_both_goals_are_of_one_problem() -> None:
     drawn = paper.draw_problem(3)
-    pose = drawn[paper.POSE]
-    joint = drawn[paper.JOINT]
+    pose, joint = drawn[paper.POSE], drawn[paper.JOINT]
     assert isinstance(pose.goal, rd.PoseGoal)
     np.testing.assert_array_equal(pose.start, joint.start)
     assert goal_error(pose.robot, pose.goal, paper.goal_configurations(joint)[0]) is None

@@ -17,10 +17,7 @@ from robotdiffuse.problems.files import Case
 FREE = rd.Problem(PANDA, rd.Scene([]), START, rd.JointGoal(GOAL[None]))
 BLOCKED = rd.Problem(PANDA, rd.Scene([rd.Sphere([0.5, 0.0, 0.5], 0.2)]), START, rd.JointGoal(GOAL[None]))
 LENGTH_OF_LINE = float(np.linalg.norm(GOAL - START))
-CASES = [
-    Case(name, "free", problem, trivial, LENGTH_OF_LINE, "mine")
-    for name, problem, trivial in (("a", FREE, True), ("b", BLOCKED, False))
-]
+CASES = [Case("a", "free", FREE, True, LENGTH_OF_LINE, "mine"), Case("b", "free", BLOCKED, False, LENGTH_OF_LINE, "mine")]
 
 
 def quick(length: float, calls: list[tuple[str, str, int]]) -> dict:

@@ -211,20 +211,17 @@ def test_other_settings_are_refused_by_name(folder: Path) -> None:
         assert factory_runs.contents(folder) == before
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_data_of_other_versions_and_robots_are_refused(folder, tmp_path):
+    for change, message in (
         (lambda data: data["versions"].update(numba="0.1"), "begun with numba 0.1; this is"),
         (lambda data: data["versions"].pop("robotdiffuse"), "begun with robotdiffuse None"),
         (lambda data: data.update(robot_fingerprint="0" * 16), "fingerprint 0000000000000000"),
         (lambda data: data.update(format=9), "format is 9"),
-    ],
-)
-def test_data_of_other_versions_and_robots_are_refused(change, message, folder, tmp_path):
-    data = json.loads((folder / "manifest.json").read_text())
-    change(data)
-    (tmp_path / "manifest.json").write_text(json.dumps(data))
-    refuses(message, generate, SETTINGS, tmp_path)
+    ):
+        data = json.loads((folder / "manifest.json").read_text())
+        change(data)
+        (tmp_path / "manifest.json").write_text(json.dumps(data))
+        refuses(message, generate, SETTINGS, tmp_path)
 
 
 def test_a_locked_folder_that_stays_empty_leaves_no_parents(tmp_path: Path) -> None:

@@ -128,10 +128,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     ),
     "joints without a range": (arm(chain("base", ["j"], limits='lower="0" upper="0"')), "limits of j leave no"),
     "a floating body": (arm(ARM, FLOATING), "remove it with what it carries"),
-    "a hand in millimeters": (
-        solid(trimesh.creation.box([50, 100, 300])),
-        'link end is 300 m long; .* scale="0.001 0.001 0.001"',
-    ),
+    "a hand in mm": (solid(trimesh.creation.box([50, 100, 300])), 'link end is 300 m long; .* scale="0.001 0.001 0.001"'),
     "a name that is a path": (arm(ARM, name="../made"), "give --name NAME"),
 }
 """What is made, and what the line says."""

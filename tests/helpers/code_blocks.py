@@ -68,9 +68,7 @@ def code_blocks(page: Path) -> list[Block]:
             begin, language, indent = opened
             code = "".join(line[indent:] + "\n" for line in lines[begin:i])
             blocks.append(Block(f"{page.relative_to(ROOT)}:{begin + 1}", begin + 1, language, code, marks, tuple(needs)))
-            opened = None
-            marks = {}
-            needs = []
+            opened, marks, needs = None, {}, []
         elif opened is None and mark and mark.group(1) == "needs":
             needs.append(mark.group(2))
         elif opened is None and mark:
@@ -89,8 +87,7 @@ def a_cloud(folder: Path) -> None:
 
 @cache
 def _rop(home: Path) -> Path:
-    size = ["--trajectories", "12", "--shard", "4"]
-    assert main(["data", "generate", *size, "--workers", "1", "--out", str(home / "rop")]) == 0
+    assert main(["data", "generate", "--trajectories", "12", "--shard", "4", "--workers", "1", "--out", str(home / "rop")]) == 0
     return home / "rop"
 
 

@@ -15,16 +15,11 @@ from robotdiffuse.robots.robot import Robot
 
 TIPS = {"panda": "panda_hand", "iiwa": "lbr_iiwa_link_7", "xarm7": "link7", "ur5": "tool0"}
 TIPS |= {"awkward": "tool", "two_arms": "left_hand"}
-DESCRIPTIONS = {
-    "panda": "panda_description/urdf/panda.urdf",
-    "xarm7": "xarm_description/urdf/xarm7.urdf",
-    "ur5": "ur_description/urdf/ur5_joint_limited_robot.urdf",
-}
+DESCRIPTIONS = {"panda": "panda_description/urdf/panda.urdf", "xarm7": "xarm_description/urdf/xarm7.urdf"}
+DESCRIPTIONS |= {"ur5": "ur_description/urdf/ur5_joint_limited_robot.urdf"}
 FILES = Path(__file__).parents[1] / "files"
 AWKWARD = (FILES / "awkward.urdf").read_text()
 """Skew axes, a prismatic and two continuous joints, a fixed joint within the chain and a branch beside it."""
-
-
 TWO_ARMS = (FILES / "two_arms.urdf").read_text()
 """Two arms that reach each other, on a torso that a planned joint turns: a tree."""
 
@@ -52,9 +47,8 @@ def example_robot(name: str) -> Robot:
 def planar_arm(*lengths: float) -> Robot:
     """Links of these lengths along x, joints about z."""
     xs = (0.0, *lengths)
-    joints = [
-        Joint(f"j{i}", "revolute", f"l{i}", f"l{i + 1}", transform(np.array([x, 0, 0])), np.array([0, 0, 1.0]))
-        for i, x in enumerate(xs[:-1])
-    ]
-    tip = Joint("tip", "fixed", f"l{len(lengths)}", "tip", transform(np.array([xs[-1], 0, 0])), np.array([0, 0, 1.0]))
+    z = np.array([0, 0, 1.0])
+    at = [transform(np.array([x, 0, 0])) for x in xs]
+    joints = [Joint(f"j{i}", "revolute", f"l{i}", f"l{i + 1}", T, z) for i, T in enumerate(at[:-1])]
+    tip = Joint("tip", "fixed", f"l{len(lengths)}", "tip", at[-1], z)
     return Robot("planar", "l0", "tip", (*joints, tip))

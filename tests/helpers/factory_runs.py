@@ -34,13 +34,8 @@ def start(out: Path, settings: GenerationSettings, workers: int) -> subprocess.P
     """Starts the command in a process group of its own."""
     sizes = {name: getattr(settings, name) for name in ("trajectories", "shard", "waypoints")} | {"workers": workers}
     options = [text for name, value in sizes.items() for text in (f"--{name}", str(value))]
-    return subprocess.Popen(
-        [*COMMAND, "data", "generate", "--out", str(out), *options],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    command = [*COMMAND, "data", "generate", "--out", str(out), *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 
 def shards(out: Path) -> int:

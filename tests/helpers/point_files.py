@@ -65,7 +65,6 @@ def text(points: ndarray, delimiter: str, header: str = "") -> bytes:
 
 def write_points(folder: Path, form: str, points: ndarray) -> Path:
     file = folder / f"cloud.{form.split()[0]}"
-    swapped = text(points[:, ::-1], ",", "z, y, x\n")
     match form:
         case "npy":
             np.save(file, points)
@@ -78,7 +77,7 @@ def write_points(folder: Path, form: str, points: ndarray) -> Path:
         case "csv":
             file.write_bytes(text(points, ","))
         case "csv with names":
-            file.write_bytes(swapped)
+            file.write_bytes(text(points[:, ::-1], ",", "z, y, x\n"))
         case "xyz":
             file.write_bytes(text(np.column_stack([points, points]), " ", "# made by hand\n"))
     return file

@@ -22,14 +22,9 @@ def serving(
 ) -> Iterator[tuple[httpx.Client, subprocess.Popen]]:
     """A context with a client of a server that is ready, and the server's process, which ends with the context."""
     paths = os.pathsep.join((str(ROOT / "src"), str(ROOT / "tests")))
-    process = subprocess.Popen(
-        [sys.executable, "-m", "helpers.serving", "serve", "--port", "0", *arguments],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=stderr,
-        text=True,
-        env=os.environ | {"PYTHONPATH": paths} | environment,
-    )
+    command = [sys.executable, "-m", "helpers.serving", "serve", "--port", "0", *arguments]
+    env = os.environ | {"PYTHONPATH": paths} | environment
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stderr, text=True, env=env)
     try:
         assert process.stdout is not None
         found = re.search(r"http://[^;]+", process.stdout.readline())

@@ -23,11 +23,8 @@ SMALL_ENCODER = PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, dec
 def small_model(seed: int = 0) -> MotionNetwork:
     """A model for the arm of boxes, with random weights in the last layer too."""
     torch.manual_seed(seed)
-    settings = MotionModelSettings(
-        waypoints=16,
-        encoder_settings=SMALL_ENCODER,
-        denoiser_settings=TransformerSettings(width=16, layers=2, heads=2, hidden=32, patch=4),
-    )
+    denoiser = TransformerSettings(width=16, layers=2, heads=2, hidden=32, patch=4)
+    settings = MotionModelSettings(waypoints=16, encoder_settings=SMALL_ENCODER, denoiser_settings=denoiser)
     model = MotionNetwork(RobotIdentity.of(box_arm()), settings)
     torch.nn.init.normal_(model.denoiser.out.weight, std=0.2)
     return model

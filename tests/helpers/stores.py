@@ -20,23 +20,12 @@ FAMILIES = ("rop", "rop_dense")
 
 
 def manifest_of(robot: Robot, waypoints: int = WAYPOINTS, **changes: Any) -> Manifest:
-    fields: dict[str, Any] = {
-        "robot": robot.name,
-        "robot_fingerprint": robot_fingerprint(robot),
-        "joint_names": robot.joint_names,
-        "lower": tuple(robot.lower.tolist()),
-        "upper": tuple(robot.upper.tolist()),
-        "waypoints": waypoints,
-        "timing": "arc",
-        "families": {"rop": {"sphere_radius": [0.25, 0.25]}},
-        "floors": {"rop": {"center": [0.0, 0.0, -0.05], "size": [2.0, 2.0, 0.1]}},
-        "slots": SLOTS,
-        "goals": GOALS,
-        "trajectories": 100,
-        "shard": 50,
-        "settings": {"seed": 0},
-        "versions": {"robotdiffuse": "0"},
-    }
+    fields: dict[str, Any] = {"robot": robot.name, "robot_fingerprint": robot_fingerprint(robot)}
+    fields |= {"joint_names": robot.joint_names, "lower": tuple(robot.lower.tolist()), "upper": tuple(robot.upper.tolist())}
+    fields |= {"waypoints": waypoints, "timing": "arc", "slots": SLOTS, "goals": GOALS, "trajectories": 100, "shard": 50}
+    fields |= {"families": {"rop": {"sphere_radius": [0.25, 0.25]}}}
+    fields |= {"floors": {"rop": {"center": [0.0, 0.0, -0.05], "size": [2.0, 2.0, 0.1]}}}
+    fields |= {"settings": {"seed": 0}, "versions": {"robotdiffuse": "0"}}
     return Manifest(**fields | changes)
 
 
@@ -60,24 +49,13 @@ def random_arrays(robot: Robot, n: int, rng: Generator, waypoints: int = WAYPOIN
     params[kinds == 0] = 0
     pose = rng.uniform(-1, 1, (n, 7)).astype(np.float32)
     pose[:, :4] = [1, 0, 0, 0]
-    return {
-        "trajectories": q,
-        "start": q[:, 0].copy(),
-        "goals": goals,
-        "goal_costs": costs,
-        "goal_index": index.astype(np.int8),
-        "target_pose": pose,
-        "obstacle_kinds": kinds,
-        "obstacle_params": params,
-        "family": np.zeros(n, np.int8),
-        "cost": np.ones(n, np.float32),
-        "clearance": np.full(n, 0.05, np.float32),
-        "end_clearance": np.full((n, 2), 0.05, np.float32),
-        "safety_distance": np.full(n, 0.05, np.float32),
-        "line_free": rng.random(n) < 0.3,
-        "detour": np.ones(n, np.float32),
-        "seed": np.arange(n, dtype=np.uint64),
-    }
+    near, one = np.full((n, 2), 0.05, np.float32), np.ones(n, np.float32)
+    arrays: dict[str, ndarray] = {"trajectories": q, "start": q[:, 0].copy(), "target_pose": pose}
+    arrays |= {"goals": goals, "goal_costs": costs, "goal_index": index.astype(np.int8)}
+    arrays |= {"obstacle_kinds": kinds, "obstacle_params": params, "family": np.zeros(n, np.int8)}
+    arrays |= {"clearance": near[:, 0].copy(), "end_clearance": near, "safety_distance": near[:, 0].copy()}
+    arrays |= {"cost": one, "detour": one.copy(), "line_free": rng.random(n) < 0.3, "seed": np.arange(n, dtype=np.uint64)}
+    return arrays
 
 
 def write_store(folder: Path, robot: Robot, sizes: tuple[int, ...], waypoints: int = WAYPOINTS) -> Manifest:
@@ -104,24 +82,13 @@ def record(robot: Robot, scene: Scene, q: ndarray, family: int = 0, line_free: b
     length = np.linalg.norm(np.diff(q.astype(np.float64), axis=0), axis=1).sum()
     costs[:2] = length, np.inf
     packed = PackedScenes.pack([scene], SLOTS)
-    return {
-        "trajectories": q,
-        "start": q[0],
-        "goals": goals,
-        "goal_costs": costs,
-        "goal_index": np.array(0),
-        "target_pose": np.array([1.0, 0, 0, 0, 0.3, 0, 0.5]),
-        "obstacle_kinds": packed.kinds[0],
-        "obstacle_params": packed.params[0],
-        "family": np.array(family),
-        "cost": length,
-        "clearance": CollisionChecker(robot, scene).link_clearances(q).min(initial=1.0),
-        "end_clearance": CollisionChecker(robot, scene).link_clearances(q[[0, -1]]).min(axis=1, initial=1.0),
-        "safety_distance": np.array(0.05 if family == 0 else 0.04),
-        "line_free": np.array(line_free),
-        "detour": length / np.linalg.norm(q[-1].astype(np.float64) - q[0]),
-        "seed": np.array(7),
-    }
+    at = CollisionChecker(robot, scene).link_clearances
+    row: dict[str, Any] = {"trajectories": q, "start": q[0], "target_pose": np.array([1.0, 0, 0, 0, 0.3, 0, 0.5])}
+    row |= {"goals": goals, "goal_costs": costs, "goal_index": np.array(0), "seed": np.array(7)}
+    row |= {"obstacle_kinds": packed.kinds[0], "obstacle_params": packed.params[0], "family": np.array(family)}
+    row |= {"clearance": at(q).min(initial=1.0), "end_clearance": at(q[[0, -1]]).min(axis=1, initial=1.0)}
+    row |= {"safety_distance": np.array(0.05 if family == 0 else 0.04), "line_free": np.array(line_free)}
+    return row | {"cost": length, "detour": length / np.linalg.norm(q[-1].astype(np.float64) - q[0])}
 
 
 def write_motions(folder: Path, robot: Robot, rows: list[dict], shard: int = 100, waypoints: int = 20) -> Manifest:

@@ -80,10 +80,9 @@ def recording(file: Path, change: Callable[[dict[str, Any]], object] = lambda me
     """One image at 1.05 s, joint states and transforms every 0.1 s, a camera on a link; `change` changes messages by topic."""
     info, image = camera("camera_optical", 1.05, "16UC1", 1e-3)
     names = list(reversed(PANDA.joint_names))
+    states = [{"header": {"stamp": stamp(t)}, "name": names, "position": (HOME[::-1] + t).tolist()} for t in (1, 1.1)]
     messages: dict[str, Any] = {
-        "/joint_states": [
-            {"header": {"stamp": stamp(t)}, "name": names, "position": (HOME[::-1] + t).tolist()} for t in (1, 1.1)
-        ],
+        "/joint_states": states,
         "/tf": [{"transforms": [pose("panda_link0", "panda_hand", at, x=at)]} for at in (1.0, 1.1)],
         "/tf_static": [{"transforms": [pose("panda_hand", "camera_optical", 0.0, x=0.5)]}],
         "/camera/camera_info": [info | {"r": np.eye(3).ravel()}],
@@ -109,10 +108,8 @@ def write_bag(bag: Writer1 | Writer2, messages: list[tuple[str, str, Any]]) -> N
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", depth_recording.TRANSFORMS))
     with bag as writer, pytest.MonkeyPatch.context() as patch:
         patch.setattr(ros2, "typestore", lambda: store)
-        connections = {
-            topic: writer.add_connection(topic, kind, typestore=store)
-            for topic, kind in dict.fromkeys((topic, kind) for topic, kind, _ in messages)
-        }
+        kinds = dict.fromkeys((topic, kind) for topic, kind, _ in messages)
+        connections = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in kinds}
         serialized = store.serialize_ros1 if isinstance(bag, Writer1) else store.serialize_cdr
         for topic, kind, content in messages:
             writer.write(connections[topic], 10**9, serialized(ros2.to_message(kind, content), kind))
@@ -236,15 +233,28 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
         refuses(message, list, rd.read_depth_views(recording(tmp_path / "r.mcap", change), PANDA))
 
 
+def test_commanded_joints_and_other_cameras_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regressions: commanded joints were mixed with the measured ones, and T_base_camera was used for every camera."""
+    monkeypatch.setitem(KINDS, "/joint_commands", ros2.JOINT_STATE)
+    command = {"header": {"stamp": stamp(1.05)}, "name": list(PANDA.joint_names), "position": (HOME + 3).tolist()}
+    file = recording(tmp_path / "r.mcap", lambda messages: messages.update({"/joint_commands": [command]}))
+    [(_, view)] = rd.read_depth_views(file, PANDA)
+    assert np.allclose(np.array(view.configuration), HOME + 1.05, atol=1e-9)
+    info, image = camera("second", 1.06, "16UC1", 1e-3)
+    more = {"/second/camera_info": [info | {"r": np.eye(3).ravel()}], "/second/image_rect": [image]}
+    for topic, kind in zip(more, (depth_recording.CAMERA_INFO, depth_recording.IMAGE), strict=True):
+        monkeypatch.setitem(KINDS, topic, kind)
+    file = recording(tmp_path / "two.mcap", lambda messages: messages.update(more))
+    refuses("pose of one camera", list, rd.read_depth_views(file, PANDA, T_base_camera=np.eye(4)))
+
+
 def test_other_files_and_topics_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("no recording")
     refuses("is no MCAP file or was cut short", list, rd.read_depth_views(tmp_path / "text.mcap", PANDA))
     other = rd.read_depth_views(recording(tmp_path / "r.mcap"), PANDA, ["/other"])
     refuses("'/other' holds no images; topics of images: /camera/image_rect", list, other)
     views = {"wrist": [depth_recording.StampedView(0.0, rd.DepthView(np.ones((2, 2)), (300, 300, 0.5, 0.5), np.eye(4)))]}
-    refuses(
-        "the view of wrist at 0 s has no configuration", depth_recording.write_depth_views, PANDA, views, tmp_path / "w.mcap"
-    )
+    refuses("view of wrist at 0 s has no configuration", depth_recording.write_depth_views, PANDA, views, tmp_path / "w.mcap")
     read = unwrap(rd.read_depth_views)
     refuses("topics is '/cam/depth'; it must be a list of names", list, read(tmp_path / "a.mcap", PANDA, "/cam/depth"))
     refuses("robot is 'panda'; it must be a Robot", list, read(tmp_path / "a.mcap", "panda"))

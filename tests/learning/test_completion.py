@@ -65,8 +65,7 @@ def test_packing_and_folding_of_voxels_are_undone() -> None:
             assert bits[(*place, bit)] == fine[tuple(2 * place + (bit >> 2, bit >> 1 & 1, bit & 1))]
     assert bits.sum() == fine.sum()
     x = torch.arange(8 * 12 * 4 * 2).reshape(2, 8, 12, 4)
-    assert (unfolded(folded(x))[..., 0] == x).all()
-    assert folded(x)[1, 2, 3, 1].tolist() == x[1, 4:6, 6:8, 2:4].ravel().tolist()
+    assert (unfolded(folded(x))[..., 0] == x).all() and folded(x)[1, 2, 3, 1].tolist() == x[1, 4:6, 6:8, 2:4].ravel().tolist()
 
 
 def test_the_network_s_inputs() -> None:
@@ -106,8 +105,7 @@ def test_training_writes_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     monkeypatch.setattr(CompletionNetwork, "exports", lambda _: {})  # it takes seconds
     report = training.train_completion(replace(TINY, samples=2), str(tmp_path))
     loaded = load_completion(tmp_path)
-    assert report["samples"] == 2 and loaded.settings == SMALL
-    assert loaded.temperature == pytest.approx(report["temperature"])
+    assert report["samples"] == 2 and loaded.settings == SMALL and loaded.temperature == pytest.approx(report["temperature"])
     refuses("robotdiffuse train completion", load_completion, tmp_path / "nothing")
 
 

@@ -55,8 +55,7 @@ def inputs(waypoints: int = 12, batch: int = 2, seed: int = 1) -> tuple[torch.Te
 @pytest.mark.parametrize("name", denoisers.DENOISERS)
 def test_untrained_network_predicts_the_mean_trajectory(name):
     out = denoisers.DENOISERS.load(name)(denoisers.DENOISERS.defaults(name), 48, DOF, FEATURES, CONDITION)(*inputs(48))
-    assert out.shape == (2, 48, DOF) and out.dtype == torch.float32
-    assert not out.any()
+    assert out.shape == (2, 48, DOF) and out.dtype == torch.float32 and not out.any()
 
 
 @pytest.mark.parametrize("name", denoisers.DENOISERS)
@@ -159,8 +158,7 @@ def test_files(tmp_path, name, null_condition):
             module.weight.data = module.weight.data.half().float()  # as they are stored
     save_network("model", model, tmp_path, {})
     loaded = load_network("model", tmp_path, box_arm())
-    assert loaded.settings == model.settings
-    assert type(loaded.denoiser) is denoisers.DENOISERS.load(name)
+    assert loaded.settings == model.settings and type(loaded.denoiser) is denoisers.DENOISERS.load(name)
     scale = 2.0 if null_condition else 1.0
     np.testing.assert_array_equal(sample(loaded, scale), sample(model.requires_grad_(False).eval(), scale))
     np.testing.assert_allclose(sample(exported_model("model", tmp_path, box_arm()), scale), sample(loaded, scale), atol=1e-4)
@@ -185,8 +183,7 @@ def test_dropped_conditions_have_no_effect(name):
     after = model.denoise(features, level, condition + 1.0, dropped)
     assert [torch.equal(a, b) for a, b in zip(before, after, strict=True)] == dropped.tolist()
     (before * dropped[:, None, None]).square().sum().backward()
-    assert model.null_condition is not None and model.null_condition.grad is not None
-    assert (model.null_condition.grad != 0).all()
+    assert model.null_condition is not None and model.null_condition.grad is not None and (model.null_condition.grad != 0).all()
 
 
 def test_scale_of_classifier_free_guidance(monkeypatch):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -11,8 +12,7 @@ from hypothesis import given, settings, strategies as st
 from helpers.box_arm import box_arm
 from helpers.commands import Said
 from helpers.refusals import refuses
-from helpers.stores import manifest_of, random_arrays
-from robotdiffuse.datasets.shards import write_manifest, write_shard
+from helpers.stores import write_store
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning import encoders
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_network, save_network
@@ -116,8 +116,7 @@ def test_gradients_reach_every_parameter(name):
         loss = loss + encoder.loss(clouds, np.random.default_rng(0))[0]
     loss.backward()
     for parameter, p in encoder.named_parameters():
-        assert p.grad is not None, parameter
-        assert p.grad.isfinite().all() and p.grad.abs().max() > 0, parameter
+        assert p.grad is not None and p.grad.isfinite().all() and p.grad.abs().max() > 0, parameter
 
 
 @every_encoder
@@ -128,8 +127,7 @@ def test_files(name, tmp_path):
             encoder.standardize(encoder.encode(cloud(40, 30)))
     save_network("encoder", encoder, tmp_path, {})
     loaded = load_encoder(tmp_path)
-    assert type(loaded) is encoders.ENCODERS.load(name)
-    assert loaded.settings == encoder.settings
+    assert type(loaded) is encoders.ENCODERS.load(name) and loaded.settings == encoder.settings
     assert not any(p.requires_grad for p in loaded.parameters())
     points = cloud(40)
     torch.testing.assert_close(loaded(points), encoder(points), atol=0.02, rtol=0)  # stored in fp16
@@ -187,18 +185,13 @@ def test_training_alone(name, tmp_path, monkeypatch):
     monkeypatch.setattr(training, "STANDARDIZATION_SCENES", 256)
     short: dict[str, Any] = {"samples": 1600, "batch": 16, "points": 64, "warmup_steps": 10}
     training_settings = EncoderTraining(name=name, minutes=None, encoder=SMALL[name], **short)
-    drawn = set()
-
-    def clouds(*given):
-        drawn.add(given[3] if len(given) > 3 else None)
-        return scene_clouds(*given)
-
+    clouds = Mock(wraps=scene_clouds)
     monkeypatch.setattr(training, "scene_clouds", clouds)
     before = train_encoder(replace(training_settings, samples=16), str(tmp_path / "short"))
     report = train_encoder(training_settings, str(tmp_path / "long"))
     error = "chamfer" if name == "point_autoencoder" else "reconstruction"
     assert report[error] < 0.9 * before[error]
-    sizes = drawn - {None}
+    sizes = {call.args[3] for call in clouds.call_args_list if len(call.args) > 3} - {None}
     if SMALL[name].any_size:
         assert sizes <= set(range(8, 65)) and len(sizes) > 30
     else:
@@ -222,10 +215,8 @@ def test_training_from_the_command_line(tmp_path, said: Said, monkeypatch):
 def data(tmp_path, monkeypatch):
     arm = box_arm()
     monkeypatch.setattr(training, "load_robot", lambda name: arm)
-    folder = tmp_path / "data"
-    write_manifest(folder, manifest_of(arm))
-    write_shard(folder, 0, random_arrays(arm, 60, np.random.default_rng(0)), {})
-    return folder
+    write_store(tmp_path / "data", arm, (60,))
+    return tmp_path / "data"
 
 
 def planner(data, encoder, **changes) -> PlannerTraining:
@@ -259,8 +250,7 @@ def test_a_frozen_encoder_stays_as_it_is(name, data, tmp_path):
     before = fingerprint(load_encoder(tmp_path / "encoder"))
     train_planner(planner(data, str(tmp_path / "encoder")), str(tmp_path / "out"))
     encoder = load_network("model", tmp_path / "out", box_arm()).encoder
-    assert encoder is not None and fingerprint(encoder) == before
-    assert fingerprint(load_encoder(tmp_path / "encoder")) == before
+    assert encoder is not None and fingerprint(encoder) == before and fingerprint(load_encoder(tmp_path / "encoder")) == before
 
 
 def test_batches_with_clouds_instead_of_codes(data):

@@ -21,14 +21,11 @@ from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.weight_files import BUNDLED
 from robotdiffuse.perception.voxel_grid import SHAPE
 
-RELATIVE_TOLERANCE = 1e-5
-"""As a fraction of the largest number: fp32 rounds to 6e-8, and a network has some hundred roundings in a row."""
-MAX_FILE_SIZE = 16e6
-
 
 def assert_same(exported: np.ndarray, ours: np.ndarray) -> None:
+    """As a fraction of the largest number: fp32 rounds to 6e-8, and a network has some hundred roundings in a row."""
     assert exported.shape == ours.shape and exported.dtype == np.float32
-    assert np.abs(exported - ours).max() < RELATIVE_TOLERANCE * np.abs(ours).max()
+    assert np.abs(exported - ours).max() < 1e-5 * np.abs(ours).max()
 
 
 @pytest.mark.parametrize("name", ["model", "trajectory_prior"])
@@ -69,7 +66,7 @@ def test_every_bundled_file_is_small_and_has_no_path_in_it() -> None:
     assert {file.suffix for file in files} == {".json", ".onnx", ".safetensors"}
     for file in files:
         data = file.read_bytes()
-        assert len(data) < MAX_FILE_SIZE and b".py" not in data, file
+        assert len(data) < 16e6 and b".py" not in data, file
 
 
 def test_a_cloud_in_order_is_that_of_the_compression_autoencoder() -> None:

@@ -39,8 +39,7 @@ def test_nearest_and_chamfer_against_all_pairs():
     allowed = torch.arange(11)[None] < 9
     distance = (a[0, :, None] - b[0, None]).norm(dim=-1)
     forth, back = nearest(a, b, allowed)
-    assert torch.equal(forth[0], distance[:, :9].argmin(1))
-    assert torch.equal(back[0, :9], distance[:, :9].argmin(0))
+    assert torch.equal(forth[0], distance[:, :9].argmin(1)) and torch.equal(back[0, :9], distance[:, :9].argmin(0))
     rms = [distance[:, :9].min(i).values.square().mean().sqrt() for i in (0, 1)]
     torch.testing.assert_close(chamfer(a, b, allowed), sum(rms), atol=1e-4, rtol=1e-4)
 
@@ -50,8 +49,7 @@ def test_noise_is_zero_at_the_ends_and_has_the_data_s_covariance(smooth):
     s = np.linspace(0, np.pi, 16)[:, None]
     factor = noise_factor(np.random.default_rng(0).standard_normal((500, 1, 2)) * np.sin(s), smooth)
     covariance = factor @ factor.T
-    assert not covariance[[0, -1]].any()
-    assert np.trace(covariance) / 14 == pytest.approx(1.0, abs=1e-3)
+    assert not covariance[[0, -1]].any() and np.trace(covariance) / 14 == pytest.approx(1.0, abs=1e-3)
     shape = (np.sin(s) @ np.sin(s).T)[1:-1, 1:-1]
     wanted = shape / (np.trace(shape) / 14) if smooth else np.eye(14)
     np.testing.assert_allclose(covariance[1:-1, 1:-1], wanted, atol=2e-3)
@@ -63,8 +61,7 @@ def test_samples_hold_start_and_goal():
     settings = SamplingSettings(samples=5, sampling_steps=6, eta=0.5)
     for guide in (None, lambda q, level: q + 0.1):
         q = sample_with(model, settings, guide)
-        assert q.shape == (5, 16, 3)
-        assert (q[:, 0] == START).all() and (q[:, -1] == GOAL).all()
+        assert q.shape == (5, 16, 3) and (q[:, 0] == START).all() and (q[:, -1] == GOAL).all()
         assert (q >= box_arm().lower).all() and (q <= box_arm().upper).all()
         assert np.abs(q[0] - q[1]).max() > 1e-3
         np.testing.assert_array_equal(sample_with(model, settings, guide), q)
@@ -73,9 +70,8 @@ def test_samples_hold_start_and_goal():
 def test_clearances_are_inputs_of_the_denoiser():
     model = small_model()
     reference = model.reference(np.zeros((2, 3)), np.ones((2, 3)))
-    x = np.zeros((2, 16, 3), np.float32)
     clearances = np.array([-5, 0.15, 9])
-    features = model.features(x, reference, lambda q: np.tile(clearances, (*q.shape[:-1], 1)))
+    features = model.features(np.zeros((2, 16, 3), np.float32), reference, lambda q: np.tile(clearances, (*q.shape[:-1], 1)))
     assert features.shape == (2, 16, 9)
     np.testing.assert_allclose(features[0, 0, 6:], [-1, 0, 1], atol=1e-6)
 
@@ -192,8 +188,7 @@ def test_a_denoiser_on_blocks_learns_all_waypoints():
     for _, block in STAGES:
         model.coarsen(block)
         output = model.denoise(*inputs)
-        assert output.shape == fine.shape
-        assert torch.equal(output, fine) == (block == 1)
+        assert output.shape == fine.shape and torch.equal(output, fine) == (block == 1)
 
 
 def test_progressive_training_needs_white_noise_and_blocks_that_fit():

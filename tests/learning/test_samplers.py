@@ -52,8 +52,7 @@ def test_stochastic_samples_have_the_data_s_moments(name):
     steps = [32, 64, 128, 256]
     moments = [exact_moments(name, schedule, n, 1.0) for n in steps]
     off = np.array([np.abs(covariance - COVARIANCE).max() for _, covariance in moments])
-    assert (np.diff(off) < 0).all() and np.polyfit(np.log(steps), np.log(off), 1)[0] < -0.8
-    assert off[-1] < 0.09
+    assert (np.diff(off) < 0).all() and np.polyfit(np.log(steps), np.log(off), 1)[0] < -0.8 and off[-1] < 0.09
     assert max(np.abs(mean - MEAN).max() for mean, _ in moments) < 2e-4
 
 
@@ -73,8 +72,7 @@ def test_calls_of_the_predictor(name, steps):
 
     x = SAMPLERS.load(name)(predict, schedule, lambda: rng.standard_normal((2, 3), dtype=np.float32), steps, 0.5)
     assert x is predictions[-1] and x.dtype == np.float32
-    assert levels == schedule.sampling_levels(steps)[:-1].tolist()
-    assert np.isfinite(x).all()
+    assert levels == schedule.sampling_levels(steps)[:-1].tolist() and np.isfinite(x).all()
 
 
 def network(x: np.ndarray, level: int) -> np.ndarray:

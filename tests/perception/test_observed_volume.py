@@ -12,9 +12,7 @@ from robotdiffuse.perception.voxel_grid import LOW, SHAPE, VOXEL
 
 AWAY = np.array([3.0, 0.0, 0.0, -0.1, 0.0, 1.571, 0.785])
 """The arm stretched upwards, out of the way of what these views look at."""
-WIDTH = 320
-HEIGHT = 240
-FOCAL = 262.0
+WIDTH, HEIGHT, FOCAL = 320, 240, 262.0
 INTRINSICS = (FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 WALL = 0.83
 """Where the wall stands: x = 1.6 - WALL in the base frame [m]."""
@@ -74,9 +72,7 @@ def test_free_voxels_hold_no_point_of_any_pixel(seed: int) -> None:
     u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     depth = flat(2.5)
     for _ in range(30):
-        a = rng.uniform(0, WIDTH)
-        b = rng.uniform(0, HEIGHT)
-        r = rng.uniform(3, 40)
+        a, b, r = rng.uniform((0, 0, 3), (WIDTH, HEIGHT, 40))
         depth[(u - a) ** 2 + (v - b) ** 2 < r * r] = rng.uniform(0.6, 2.4)
     seen = observe([view(depth)], PANDA, AWAY)
     index = np.floor((view(depth).points() - LOW) / VOXEL).astype(int)
@@ -110,8 +106,7 @@ def test_the_arm_is_no_obstacle_and_casts_a_shadow() -> None:
     elsewhere = observe([view(depth.astype(np.float32), q=AWAY)], PANDA, AWAY)
     assert elsewhere.occupied.sum() > 50, "with the arm elsewhere, the points are an obstacle's"
     along = (PANDA.fk(HOME, "panda_hand")[:3, 3] - T[:3, 3]) * 1.4 + T[:3, 3]
-    assert seen.shadow[tuple(((along - LOW) / VOXEL).astype(int))]
-    assert not (seen.shadow & (seen.free | seen.occupied)).any()
+    assert seen.shadow[tuple(((along - LOW) / VOXEL).astype(int))] and not (seen.shadow & (seen.free | seen.occupied)).any()
 
 
 def test_a_pixel_that_saw_nothing_in_range_is_free_and_one_without_return_says_nothing() -> None:
@@ -146,14 +141,12 @@ def test_missing_returns_and_flying_pixels_change_little() -> None:
     clean[:, :100] = 2.0
     clean[:, 100:160] = 1.2
     exact = observe([view(clean)], PANDA, AWAY)
-    flying = clean.copy()
-    lost = clean.copy()
+    flying, lost = clean.copy(), clean.copy()
     flying[:, 100] = rng.uniform(1.3, 1.9, HEIGHT)
     lost[rng.random(lost.shape) < 0.05] = 0
     for image in (flying, lost):
         seen = observe([view(image)], PANDA, AWAY)
-        assert not (seen.occupied & ~exact.occupied).any()
-        assert (exact.occupied & ~seen.occupied).mean() < 1e-3
+        assert not (seen.occupied & ~exact.occupied).any() and (exact.occupied & ~seen.occupied).mean() < 1e-3
         assert (seen.free & ~exact.free).mean() < 1e-3 and (exact.free & ~seen.free).mean() < 1e-2
 
 

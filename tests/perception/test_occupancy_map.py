@@ -54,8 +54,7 @@ def test_what_obstacles_may_reach_is_free_only_by_a_margin_of_the_own_error() ->
     known.doubt(points, errors)
     reached = MAP.within(np.column_stack([points, errors]))
     doubted = before & ~known.free
-    assert 0 < doubted.sum() < 0.2 * before.sum()
-    assert (doubted <= MAP.within(np.column_stack([points, errors + 0.03]))).all()
+    assert 0 < doubted.sum() < 0.2 * before.sum() and (doubted <= MAP.within(np.column_stack([points, errors + 0.03]))).all()
     narrow = carve_view(far, PANDA, HOME, MAP, narrowed=1.0)[0] == FREE
     assert (known.free & reached <= narrow).all() and known.unknown[doubted].all()
     declared = OccupancyMap(PANDA)
@@ -69,13 +68,11 @@ def test_what_obstacles_may_reach_is_free_only_by_a_margin_of_the_own_error() ->
 
 
 def test_a_view_counts_once_and_the_order_does_not_matter() -> None:
-    ahead = OccupancyMap(PANDA)
-    back = OccupancyMap(PANDA)
+    ahead, back = OccupancyMap(PANDA), OccupancyMap(PANDA)
     views = [view_from(b) for b in (-1.0, 0.2, 1.1)]
-    for view in views:
-        ahead.add(view)
-    for view in reversed(views):
-        back.add(view)
+    for first, last in zip(views, reversed(views), strict=True):
+        ahead.add(first)
+        back.add(last)
     np.testing.assert_array_equal(ahead.free, back.free)
     np.testing.assert_array_equal(ahead.occupied, back.occupied)
 

@@ -100,9 +100,7 @@ def test_pybullets_camera_sees_the_same(tmp_path: Path) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_voxels_that_hold_obstacles(seed: int) -> None:
     scene = random_scene(np.random.default_rng(seed))
-    low = (-0.5, -0.6, -0.4)
-    voxel = 0.04
-    shape = (20, 25, 22)
+    low, shape, voxel = (-0.5, -0.6, -0.4), (20, 25, 22), 0.04
     found = voxels_within(scene, VoxelGrid(low, shape, voxel), 0.01)
     centers = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1) * voxel + voxel / 2 + low
     nearest = np.min([distance(one, centers) for one in scene.shapes], axis=0)

@@ -54,8 +54,7 @@ def test_balls_seen_through_are_those_with_nothing_in_any_of_their_pixels() -> N
         return np.array([of is not None and bool((of > behind).all()) for of, behind in zip(pixels, far, strict=True)])
 
     least, most = empty(3), empty(0)
-    assert 100 < least.sum() < seen.sum() < most.sum() < len(BALLS)
-    assert not (least & ~seen).any() and not (seen & ~most).any()
+    assert 100 < least.sum() < seen.sum() < most.sum() < len(BALLS) and not (least & ~seen).any() and not (seen & ~most).any()
 
 
 @pytest.mark.parametrize(("lost", "seen"), [(0.6 * visibility.MAX_LOST_FRACTION, True), (0.6, False), (1.0, False)])
@@ -79,9 +78,7 @@ def test_noise_asks_for_more_distance_and_filtered_images_for_more_pixels() -> N
 
 def test_balls_lie_within_voxels_if_all_of_them_do() -> None:
     marked = RNG.random((30, 30, 30)) < 0.95
-    low = 0.2, -0.3, 0.2
-    edge = 0.02
-    radius = 0.008
+    low, edge, radius = (0.2, -0.3, 0.2), 0.02, 0.008
     within = visibility.within_voxels(BALLS, radius, marked, VoxelGrid(low, marked.shape, edge))
     for ball, found in zip(BALLS[:500].astype(np.float64), within[:500], strict=True):
         corners = np.stack(np.meshgrid(*np.stack([ball - radius, ball + radius], axis=1)), -1).reshape(-1, 3)

@@ -65,8 +65,7 @@ def test_clouds_and_several_views_add_up() -> None:
 def test_the_scene_is_what_is_known_and_what_was_seen() -> None:
     floor = rd.Box([0.0, 0.0, -0.05], [3.0, 3.0, 0.1], name="floor")
     problem = rd.Problem(PANDA, rd.Scene([floor]), START, GOAL, views=[view(BALL_ROW)], unknown="padded")
-    assert [shape.name for shape in problem.scene.shapes] == ["floor", "seen"]
-    assert problem.known_scene.shapes == (floor,)
+    assert [shape.name for shape in problem.scene.shapes] == ["floor", "seen"] and problem.known_scene.shapes == (floor,)
     assert len(replace(problem, unknown="occupied").scene.shapes) == 2
     assert rd.Problem(PANDA, rd.Scene([BALL]), START, GOAL, views=[view(BALL_ROW)]).scene.shapes == (BALL,)
 
@@ -137,5 +136,4 @@ def test_each_point_is_larger_by_what_its_own_view_may_be_off() -> None:
     for shape in shown.point_shapes(points, PANDA, rd.Scene([]), START, START[None], errors):
         own = errors[np.isin(single, shape.points.astype(np.float32)).all(axis=1), 0]
         grown = shape.point_radius - shown.POINT_RADIUS
-        assert len(own) == len(shape.points)
-        assert grown - shown.ERROR_STEP < own.min() and own.max() <= grown + 1e-9
+        assert len(own) == len(shape.points) and grown - shown.ERROR_STEP < own.min() and own.max() <= grown + 1e-9

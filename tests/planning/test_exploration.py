@@ -24,7 +24,14 @@ from robotdiffuse.perception.voxel_grid import MAP
 from robotdiffuse.planning.exploration import simulated
 from robotdiffuse.planning.exploration.explorer import braked
 from robotdiffuse.planning.exploration.steps import DONE
-from robotdiffuse.planning.exploration.viewpoints import GoalSeen, ReachableTree, best_viewpoints, not_seen_free, poses_around
+from robotdiffuse.planning.exploration.viewpoints import (
+    GoalSeen,
+    ReachableTree,
+    best_viewpoints,
+    not_seen_free,
+    poses_around,
+    reaches_outside,
+)
 from robotdiffuse.trajectories.speed_limits import jerk_limits
 
 LEFT, RIGHT = (np.array([turn, *HOME[1:]]) for turn in (0.5, -1.7))
@@ -502,3 +509,36 @@ def test_observe_and_stop_refuse_arguments_of_the_wrong_kind() -> None:
     refuses(
         "motion has the joints a; panda's are", explorer.stop, rd.Trajectory(("a",), np.zeros(1), *[np.zeros((1, 1))] * 3), 0.0
     )
+
+
+AHEAD = rd.pose([0.3, -1.0, 0.5], rpy=[-np.pi / 2, 0, 0])
+K = (230.0, 230.0, 159.5, 119.5)
+
+
+def test_stale_views_covered_cameras_and_space_out_of_range_free_nothing() -> None:
+    """Regressions: such views erased obstacles or freed space, up to the range of the sensor or beyond it."""
+    known = OccupancyMap(PANDA, max_age=1.0)
+    known.add(rd.DepthView(np.full((240, 320), 0.8), K, AHEAD, HOME), 10.0)
+    before = known.occupied.copy()
+    known.add(rd.DepthView(np.full((240, 320), 1.5), K, AHEAD, HOME), 0.0)
+    assert (known.occupied == before).all()
+    stray = np.zeros((240, 320))
+    stray[::60, ::60] = 1.0
+    covered, memory = OccupancyMap(PANDA), ViewMemory(PANDA)
+    covered.add(rd.DepthView(stray, K, AHEAD, HOME, range=2.0))
+    assert not covered.free.any()
+    far = rd.DepthView(np.full((240, 320), np.inf), K, rd.pose([0, -4, 0]) @ AHEAD, HOME, range=1.0)
+    memory.add(far, 1, far, 0.0, covered.oldest)
+    assert len(GoalSeen(PANDA, covered, memory, True).unseen(HOME, HOME + np.eye(7)[0])) > 1000
+
+
+def test_pedestals_contacts_and_the_range_of_a_camera_are_respected() -> None:
+    """Regressions: Baxter reached "out of the map", contacts of the floor were ignored, a next view saw beyond its range."""
+    baxter = rd.load_robot("baxter_left")
+    assert not reaches_outside(baxter, (baxter.lower + baxter.upper) / 2)
+    touching = rd.Scene([replace(FLOOR, center=[0, 0, -0.1])], {"floor": ["panda_hand"]})
+    arm = simulated.simulated_explorer(rd.Problem(PANDA, touching, "ready", "extended"), rd.ExplorerSettings(), None, 0)
+    assert arm.scene.allowed_contacts == touching.allowed_contacts
+    near = rd.DepthView(np.full((48, 64), 0.4), [50, 50, 31.5, 23.5], AHEAD, range=0.5)
+    problem = rd.Problem(PANDA, rd.Scene(), "ready", "extended", views=[near], unknown="optimistic")
+    assert rd.next_view(problem, rd.plan(problem, until="first")).seen == 0.0

@@ -55,8 +55,7 @@ def test_solved_means_verified(name: str, number: int) -> None:
         return
     assert rd.verify(problem, result.path).valid and rd.verify(problem, result.trajectory).valid
     times, lengths = np.array(result.progress).T
-    assert (np.diff(times) >= 0).all() and (np.diff(lengths) < 0).all()
-    assert lengths[-1] == pytest.approx(result.path.length)
+    assert (np.diff(times) >= 0).all() and (np.diff(lengths) < 0).all() and lengths[-1] == pytest.approx(result.path.length)
 
 
 def test_a_goal_in_collision_is_reported_and_time_limit_and_seed_are_checked(name: str) -> None:
@@ -344,8 +343,7 @@ def test_a_script_that_processes_cannot_import_is_an_error(others: str, tmp_path
 
 
 TURNING = {"kind": "continuous", "lower": -CONTINUOUS_LIMIT, "upper": CONTINUOUS_LIMIT}
-JOINTS = tuple(replace(j, **TURNING) if j.name in ("j0", "j2") else j for j in box_arm().joints)
-ARM = replace(box_arm(), joints=JOINTS)
+ARM = replace(box_arm(), joints=tuple(replace(j, **TURNING) if j.name in ("j0", "j2") else j for j in box_arm().joints))
 POST = rd.Scene([rd.Box([-0.7, 0.0, 0.0], [0.4, 0.05, 0.2], name="post")])
 """Where the stretched arm points at half a turn."""
 
@@ -384,15 +382,13 @@ def test_values_wrapped_to_half_a_turn_are_no_motion_but_those_of_a_file_are_unw
     wrapped = (motion.positions + np.pi) % (2 * np.pi) - np.pi
     for rows in (rd.Path(ARM.joint_names, wrapped), replace(motion, positions=wrapped)):
         violation = rd.verify(problem, rows).violation
-        assert violation.kind == "jump" and violation.subject == "j0"
-        assert "unwrap" in violation.message
+        assert violation.kind == "jump" and violation.subject == "j0" and "unwrap" in violation.message
     for times in (None, motion.times):
         velocities = None if times is None else motion.velocities
         read = motion_of_robot(RecordedMotion(ARM.joint_names, wrapped, times, velocities), ARM)
         assert isinstance(read.motion, rd.Path if times is None else rd.Trajectory)
         assert read.notes[0] == "values of j0 jump by whole turns; they were unwrapped"
-        assert np.allclose(read.motion.positions, motion.positions)
-        assert rd.verify(problem, read.motion).valid
+        assert np.allclose(read.motion.positions, motion.positions) and rd.verify(problem, read.motion).valid
 
 
 def test_images_of_a_goal() -> None:

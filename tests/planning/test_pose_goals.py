@@ -81,8 +81,7 @@ def test_the_validator_names_the_hand_that_is_elsewhere() -> None:
     left_only = np.where([name.startswith("left") for name in baxter().joint_names], there, start)
     assert not rd.verify(problem, rd.Path(baxter().joint_names, np.stack([start, left_only]))).valid
     error = goal_error(baxter(), goal, left_only)
-    assert error is not None and error.subject == "right_gripper"
-    assert goal_error(baxter(), goal, there) is None
+    assert error is not None and error.subject == "right_gripper" and goal_error(baxter(), goal, there) is None
 
 
 def test_constraints_are_kept_at_the_poses() -> None:
@@ -201,8 +200,7 @@ def test_a_pose_nearby_is_reached_by_the_nearest_configuration(arm: str) -> None
         ):
             result = rd.plan(problem, 10.0)
             assert result.solved, result.reason
-            assert result.path.length <= longest
-            assert result.goal_index == (1 if isinstance(problem.goal, rd.AnyGoal) else 0)
+            assert result.path.length <= longest and result.goal_index == (1 if isinstance(problem.goal, rd.AnyGoal) else 0)
         return
     raise AssertionError("no starts")
 
@@ -299,5 +297,4 @@ def test_the_goal_index_names_the_goal_that_is_reached() -> None:
     result = rd.plan(rd.Problem(PANDA, FREE, start, goals))
     assert result.goal_index is not None
     reached = goals.goals[result.goal_index]
-    assert isinstance(reached, rd.PoseGoal)
-    assert np.abs(PANDA.fk(result.path.positions[-1]) - reached.T_base_frame).max() < 1e-4
+    assert isinstance(reached, rd.PoseGoal) and np.abs(PANDA.fk(result.path.positions[-1]) - reached.T_base_frame).max() < 1e-4

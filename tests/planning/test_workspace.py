@@ -96,8 +96,7 @@ def test_lines_through_waypoints_are_one_motion() -> None:
     off = np.minimum(np.minimum(abs(x), abs(x - 0.05)), np.minimum(abs(y), abs(y - 0.05)))
     assert off.max() < 0.001 and np.abs(z).max() < 0.001
     far = space.plan_line(T @ rd.pose([0.0, 0.0, 2.0]), HOME, waypoints=corners[:1], time_limit=4.0)
-    assert not far.solved and far.reason.startswith("line 2 of 2: ") and far.fraction is not None
-    assert 0.5 < far.fraction < 1.0
+    assert not far.solved and far.reason.startswith("line 2 of 2: ") and far.fraction is not None and 0.5 < far.fraction < 1.0
 
 
 def test_a_line_to_a_goal_with_tolerances_turns_no_more_than_it_must() -> None:
@@ -243,14 +242,12 @@ def test_motions_are_joined_with_and_without_a_stop() -> None:
     end = there.path.positions[-1]
     back = space.plan(ABOVE, end, time_limit=10.0)
     stopping = rd.join([there, back], time_limit=20.0)
-    assert stopping.stops == 1
-    assert stopping.duration == pytest.approx(there.duration + back.duration)
+    assert stopping.stops == 1 and stopping.duration == pytest.approx(there.duration + back.duration)
     passing = rd.join([there, back], 0.1, time_limit=20.0)
     assert passing.stops == 0 and passing.duration < stopping.duration
     for one in (stopping, passing):
         assert len(one.problem.waypoints) == 1
-        assert rd.verify(one.problem, one.trajectory).valid
-        assert rd.certify(one.problem, one.trajectory).check(one.problem).valid
+        assert rd.verify(one.problem, one.trajectory).valid and rd.certify(one.problem, one.trajectory).check(one.problem).valid
     line = space.plan_line(space.pose(end) @ rd.pose([0.0, 0.0, -0.05]), end, time_limit=10.0)
     assert rd.join([there, line], time_limit=10.0).solved
     space.remove("can")

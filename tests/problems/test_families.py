@@ -118,12 +118,10 @@ def test_papers_scenes() -> None:
     obstacles = [shape for shape in shapes if shape.name != "floor"]
     spheres = [shape for shape in obstacles if isinstance(shape, Sphere)]
     cubes = [shape for shape in obstacles if isinstance(shape, Box)]
-    assert len(spheres) + len(cubes) == 600 and 220 < len(spheres) < 380
-    assert {shape.radius for shape in spheres} == {0.25}
+    assert len(spheres) + len(cubes) == 600 and 220 < len(spheres) < 380 and {shape.radius for shape in spheres} == {0.25}
     assert {(*shape.size, *shape.wxyz) for shape in cubes} == {(0.2, 0.2, 0.2, 1, 0, 0, 0)}
     centers = np.array([shape.center for shape in (*spheres, *cubes)])
-    assert (centers >= [-1, -1, 0.1]).all() and (centers <= 1).all()
-    assert np.abs(centers.mean(axis=0) - [0, 0, 0.55]).max() < 0.1
+    assert (centers >= [-1, -1, 0.1]).all() and (centers <= 1).all() and np.abs(centers.mean(axis=0) - [0, 0, 0.55]).max() < 0.1
 
 
 def test_every_setting_counts() -> None:

@@ -25,6 +25,7 @@ MIDDLE = [0, -0.9, 0, -2.6, 0, 1.8, 0.2]
 END = [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
 POST = rd.Cylinder([0.5, 0.0, 0.3], 0.04, 0.6, name="post")
 TABLE = {"box": {"center": [0.55, 0, 0.1], "size": [0.5, 1.0, 0.2], "wxyz": [0.9, 0, 0, 0.2], "name": "table"}}
+GOOD = {"robot": "panda", "scene": [TABLE], "start": START, "goal": {"joints": END}}
 AHEAD = transform(np.array([0.5, 0.0, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
 WIDE = rd.PoseGoal("panda_hand", AHEAD, [0.0, 0.35, 0.0], [0.0, 0.0, np.pi])
 DOWN = transform(np.array([0.45, 0.3, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
@@ -47,8 +48,7 @@ def test_tolerances_are_along_the_axes_of_the_goal() -> None:
         ([1.0, 1, 1], None, ([0.5, 0.5, 0.5], [0.2, 0, 0]), ([0.5, 0, 0], [0.3, 0, 0])),
     ):
         goal = rd.PoseGoal("panda_hand", np.eye(4), xyz, rpy)
-        assert not off(goal, *within)
-        assert off(goal, *beyond)
+        assert not off(goal, *within) and off(goal, *beyond)
 
 
 def test_a_box_of_positions_is_reached_where_its_middle_is_blocked() -> None:
@@ -104,8 +104,7 @@ def test_blended_waypoints_are_passed_within_their_blend_without_a_stop(blend: f
     problem = replace(stopped, blend=blend)
     one, other = (rd.plan(p, time_limit=10.0).trajectory for p in (problem, stopped))
     assert one is not None and other is not None
-    assert verify_trajectory(problem, one).valid and verify_trajectory(stopped, other).valid
-    assert one.duration < other.duration
+    assert verify_trajectory(problem, one).valid and verify_trajectory(stopped, other).valid and one.duration < other.duration
     assert np.linalg.norm(one.velocities[1:-1], axis=1).min() > 1e-3
     for k, goal in enumerate(way):
         assert nearest(one, goal) <= blend + 1e-5
@@ -142,10 +141,7 @@ def test_the_leg_that_fails_is_named_and_not_repeated_for_a_configuration_in_col
 
 def test_files_keep_goals_and_waypoints(tmp_path: Path) -> None:
     pose = {"frame": "panda_hand", "xyz": [0.0, 0.1, 0.3], "wxyz": [0.0, 1.0, 0.0, 0.0]}
-    record = {
-        "robot": "panda",
-        "scene": [TABLE],
-        "start": START,
+    record = GOOD | {
         "goal": {"any": [{"pose": pose | {"relative_to": "table", "rpy_tolerance": [0, 0, 3.1]}}, {"joints": END}]},
         "waypoints": [{"joints": MIDDLE}, {"pose": pose | {"xyz_tolerance": [0.1, 0.1, 0.0]}}],
         "blend": [0.0, 0.05],
@@ -182,8 +178,7 @@ WRONG = {
 
 @pytest.mark.parametrize(("extra", "message"), WRONG.values(), ids=WRONG)
 def test_wrong_goals_are_one_line(extra: dict[str, Any], message: str, tmp_path: Path) -> None:
-    good = {"robot": "panda", "scene": [TABLE], "start": START, "goal": {"joints": END}}
-    refuses(message, rd.load_problem, written(tmp_path, good | extra))
+    refuses(message, rd.load_problem, written(tmp_path, GOOD | extra))
 
 
 def test_poses_are_drawn_on_as_long_as_none_is_free() -> None:

@@ -38,8 +38,7 @@ def test_one_rule(tmp_path: Path, kept: bool) -> None:
     referee = Referee()
     cases = CaseFile(tmp_path / "a" / "rop.jsonl" if kept else None)
     hard = cases.held_out("rop", 4, referee.validator, referee.search)
-    assert names(hard) == ["rop/1", "rop/2", "rop/4", "rop/7"]
-    assert [case.reference for case in hard] == [1.0, 2.0, 4.0, 7.0]
+    assert names(hard) == ["rop/1", "rop/2", "rop/4", "rop/7"] and [case.reference for case in hard] == [1.0, 2.0, 4.0, 7.0]
     assert all(case.hard and not case.trivial and case.family == "rop" for case in hard)
     every = cases.held_out("rop", 8, referee.validator)
     assert [case.trivial for case in every] == [i % 3 == 0 for i in range(8)]
@@ -55,15 +54,13 @@ def test_one_rule(tmp_path: Path, kept: bool) -> None:
 
 def test_goes_on_with_what_is_known(tmp_path: Path) -> None:
     file = tmp_path / "rop.jsonl"
-    first = Referee()
-    second = Referee()
+    first, second, third = (Referee() for _ in range(3))
     CaseFile(file).held_out("rop", 5, first.validator)
     assert len(first.validated) == 5 and not first.searched
     hard = CaseFile(file).held_out("rop", 4, second.validator, second.search)
     assert names(hard) == ["rop/1", "rop/2", "rop/4", "rop/7"]
     assert len(second.validated) == 3, "numbers 5, 6 and 7"
     assert len(second.searched) == 5, "numbers 1, 2, 4, 5 and 7"
-    third = Referee()
     assert names(CaseFile(file).held_out("rop", 4, third.validator, third.search)) == names(hard)
     assert not third.validated and not third.searched
     assert names(CaseFile(file).cases(hard=True)) == names(hard)

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import util
 from pathlib import Path
@@ -24,11 +24,16 @@ from robotdiffuse.processes.workers import EndedError, OverrunError, Worker, Wor
 HELD = 60  # longer than a worker may outlive its parent [s]
 
 
+def ends(message: str, call: Callable[..., object], *arguments: object) -> None:
+    with pytest.raises(EndedError, match=message):
+        call(*arguments)
+
+
 @pytest.fixture
 def worker() -> Iterator[Worker]:
     made = Worker()
     yield made
-    made.close(0.0)
+    made.close()
 
 
 def test_a_single_worker_is_replaced_when_it_dies_or_is_ended(worker: Worker) -> None:
@@ -39,17 +44,15 @@ def test_a_single_worker_is_replaced_when_it_dies_or_is_ended(worker: Worker) ->
     os.kill(second, signal.SIGKILL)  # between two calls, such as when memory runs out
     waiting.until(lambda: second not in [process.pid for process in multiprocessing.active_children()])
     third = worker.call(os.getpid)
-    worker.end(0.0)
+    worker.end()
     fourth = worker.call(os.getpid)
     assert len({first, second, third, fourth, os.getpid()}) == 5
     with ThreadPoolExecutor(1) as threads:
         sent = threads.submit(worker.call, time.sleep, HELD)
         os.kill(fourth, signal.SIGTERM)
-        with pytest.raises(EndedError, match="by SIGTERM"):
-            sent.result(HELD)
+        ends("by SIGTERM", sent.result, HELD)
     worker.close()
-    with pytest.raises(EndedError, match="closed"):
-        worker.call(os.getpid)
+    ends("closed", worker.call, os.getpid)
 
 
 def test_closing_waits_for_a_process_that_is_starting(worker: Worker, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -67,10 +70,9 @@ def test_closing_waits_for_a_process_that_is_starting(worker: Worker, monkeypatc
     with ThreadPoolExecutor(1) as threads:
         sent = threads.submit(worker.call, os.getpid)
         assert begun.wait(HELD)
-        worker.close(0.0)
+        worker.close()
         assert not Path(f"/proc/{pids[0]}").exists()
-        with pytest.raises(EndedError, match="closed"):
-            sent.result(HELD)
+        ends("closed", sent.result, HELD)
 
 
 def test_too_many_workers_are_refused() -> None:
@@ -169,8 +171,7 @@ def test_running_and_waiting_calls_are_cancelled(monkeypatch: pytest.MonkeyPatch
         last = workers.submit(time.sleep, float(HELD)), workers.submit(os.getpid)
         waiting.until(last[0].running, HELD)
     for call in last:
-        with pytest.raises(EndedError, match="closed"):
-            call.result(HELD)
+        ends("closed", call.result, HELD)
 
 
 def fail_without(file: str) -> bool:
@@ -186,8 +187,7 @@ def test_ready_workers_are_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         [worker] = workers.workers
         assert worker.ready
         first = workers.submit(os.getpid).result(HELD)
-        with pytest.raises(EndedError, match="by SIGKILL"):
-            workers.submit(os.kill, first, signal.SIGKILL).result(HELD)
+        ends("by SIGKILL", workers.submit(os.kill, first, signal.SIGKILL).result, HELD)
         waiting.until(lambda: worker.ready, HELD)
         assert workers.submit(os.getpid).result(HELD) != first
 
@@ -260,7 +260,5 @@ def test_a_call_after_the_end_and_a_signal_without_a_name(worker: Worker) -> Non
     """Regressions: the call waited forever; the signal was a ValueError."""
     with Workers(1) as workers:
         pass
-    with pytest.raises(EndedError, match="closed"):
-        workers.submit(abs, -3).result(HELD)
-    with pytest.raises(EndedError, match="by signal"):
-        worker.call(os.kill, worker.call(os.getpid), signal.SIGRTMIN + 1)
+    ends("closed", lambda: workers.submit(abs, -3).result(HELD))
+    ends("by signal", worker.call, os.kill, worker.call(os.getpid), signal.SIGRTMIN + 1)

@@ -48,11 +48,8 @@ def test_spheres_cover_surface_and_inside(mesh: ConvexMesh) -> None:
     spheres = cover(mesh)
     points = np.random.default_rng(1).uniform(mesh.vertices.min(0), mesh.vertices.max(0), (100_000, 3))
     points = np.concatenate([points[inside(mesh, points)], mesh.vertices])
-    held = np.zeros(len(points), dtype=bool)
-    for x, y, z, r in spheres:
-        held |= np.linalg.norm(points - [x, y, z], axis=1) <= r
-    assert held.all()
-    assert len(spheres) <= MAX_SPHERES
+    held = np.any([np.linalg.norm(points - center, axis=1) <= r for *center, r in spheres], axis=0)
+    assert held.all() and len(spheres) <= MAX_SPHERES
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.kind)
@@ -63,8 +60,7 @@ def test_polyhedra_hold_shapes_and_are_little_larger(shape: Shape) -> None:
     surface = shape.world_vertices if isinstance(shape, rd.Mesh) else draw(shape, 2000, np.random.default_rng(2))
     points = (surface - T[:3, 3]) @ T[:3, :3]
     [mesh] = robot.meshes[shape.name]
-    assert inside(mesh, points, 1e-9).all()
-    assert (np.ptp(mesh.vertices, axis=0) <= np.ptp(points, axis=0) * 1.03 + 1e-3).all()
+    assert inside(mesh, points, 1e-9).all() and (np.ptp(mesh.vertices, axis=0) <= np.ptp(points, axis=0) * 1.03 + 1e-3).all()
 
 
 def test_what_is_made_of_the_arm_is_what_is_made_anew() -> None:
@@ -79,8 +75,7 @@ def test_what_is_made_of_the_arm_is_what_is_made_anew() -> None:
 def test_same_content_is_the_same_robot() -> None:
     box = {"center": [0.1, 0, 0], "size": [0.05, 0.05, 0.1]}
     one, two = (box_arm().attach(rd.Box(**box), "l3") for _ in range(2))
-    assert one is two
-    assert box_arm().attach(rd.Box(**box, name="other"), "l3") is not one
+    assert one is two and box_arm().attach(rd.Box(**box, name="other"), "l3") is not one
     assert box_arm().attach(rd.Box(**box), "l3", ["l1"]) is not one
     assert one.detach("box") is box_arm() and one.arm is box_arm()
     assert robot_fingerprint(one) != robot_fingerprint(box_arm())

@@ -26,9 +26,7 @@ FAR = [0.6, 0.6, 0, -1.0, 0, 2.2, 0.2]
 
 def test_a_pendulum_by_hand() -> None:
     dynamics = Dynamics(pendulum(), rd.Payload(1.5, [0.0, 0.0, -1.0]))
-    q = np.array([[0.7]])
-    v = np.array([[1.3]])
-    a = np.array([[2.0]])
+    q, v, a = (np.array([[value]]) for value in (0.7, 1.3, 2.0))
     expected = (2 * 0.5 + 1.5) * GRAVITY * np.sin(0.7) + (2 / 12 + 2 * 0.25 + 1.5) * 2.0
     assert dynamics.torques(q, v, a)[0, 0] == pytest.approx(expected, abs=1e-9)
     lying = transform(np.zeros(3), rotation_about(np.array([0.0, 1.0, 0.0]), np.pi / 2))  # gravity along the base's x
@@ -46,8 +44,7 @@ def test_torques_are_those_of_the_urdf(name: str, tmp_path: Path) -> None:
     data = model.createData()
     ours = Dynamics(robot, rd.Payload(0.0))
     rng = np.random.default_rng(0)
-    assert tuple(model.names[1:]) == robot.joint_names
-    assert np.allclose(ours.limits, model.effortLimit)
+    assert tuple(model.names[1:]) == robot.joint_names and np.allclose(ours.limits, model.effortLimit)
     for _ in range(50):
         q, v, a = rng.uniform(robot.lower, robot.upper), *rng.normal(size=(2, robot.dof))
         assert np.allclose(ours.torques(q[None], v[None], a[None])[0], pinocchio.rnea(model, data, q, v, a), atol=1e-6)

@@ -127,8 +127,7 @@ def test_never_below_and_close_to_sampled_maxima(name: str) -> None:
     robot = with_spheres(name)
     radii = motion_radii(robot)
     sampled = sampled_radii(robot, 20_000)
-    assert (radii >= sampled).all()
-    assert ((radii > 0) == (sampled > 0)).all()
+    assert (radii >= sampled).all() and ((radii > 0) == (sampled > 0)).all()
     # the bound itself is within 1 %; the rest is the gap between sampled and true maxima
     assert (radii <= 1.04 * sampled + 1e-3).all()
 
@@ -202,8 +201,7 @@ def test_position_only(seed: int, x: float, y: float, z: float) -> None:
     T = transform(np.array([x, y, z]))
     settings = InverseKinematicsSettings(position_only=True)
     q = inverse_kinematics(robot, "panda_link8", T, 10, rng=np.random.default_rng(seed), settings=settings)
-    assert len(q) == 10
-    assert errors(robot, "panda_link8", T, q)[0] <= 2e-6
+    assert len(q) == 10 and errors(robot, "panda_link8", T, q)[0] <= 2e-6
 
 
 @pytest.mark.parametrize("xyz", [(5.0, 0.0, 0.5), (0.85, 0.0, 0.6), (0.0, 0.0, -0.9)], ids=["far", "just too far", "below"])

@@ -101,8 +101,7 @@ def test_a_pose_does_not_say_how_often_a_joint_turns() -> None:
     assert np.array_equal(panda.equivalent_configurations(panda.upper, panda.lower), panda.upper[None])
 
 
-LEFT = "panda_finger_joint1"
-RIGHT = "panda_finger_joint2"
+LEFT, RIGHT = "panda_finger_joint1", "panda_finger_joint2"
 
 
 def test_fifty_problem_files_with_locked_joints_share_one_robot(tmp_path: Path) -> None:

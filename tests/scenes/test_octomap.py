@@ -41,8 +41,7 @@ def written(file: Path, keys: set[Key], edge: float = 0.05) -> Path:
 def test_occupied_voxels_are_read(tmp_path: Path) -> None:
     keys = {(3, -4, 7), (-1, 0, 2), (100, 100, -100)}
     points, edge = read_octomap(written(tmp_path / "map.bt", keys))
-    expected = (np.array(sorted(keys)) + 0.5) * 0.05
-    np.testing.assert_allclose(points[np.lexsort(points.T[::-1])], expected, atol=1e-12)
+    np.testing.assert_allclose(points[np.lexsort(points.T[::-1])], (np.array(sorted(keys)) + 0.5) * 0.05, atol=1e-12)
     assert edge == 0.05
 
 

@@ -48,8 +48,7 @@ def surface_distance(shape: Shape, points: ndarray) -> ndarray:
 
 
 def test_points_are_drawn_on_every_shape() -> None:
-    drawn_by_triangles = {rd.HeightMap}
-    assert {*KINDS.values()} - drawn_by_triangles == {type(shape) for shape in SHAPES.values()}
+    assert {*KINDS.values()} - {rd.HeightMap} == {type(shape) for shape in SHAPES.values()}, "that is drawn by triangles"
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -187,8 +186,7 @@ def test_point_files_without_points_that_are_not_finite(form: str, tmp_path: Pat
     points, notes = read_points(write_points(tmp_path, form, POINTS))
     assert notes == () and (points == POINTS).all()
     spoilt = POINTS.copy()
-    spoilt[3] = np.nan
-    spoilt[9, 1] = np.nan
+    spoilt[3] = spoilt[9, 1] = np.nan
     points, notes = read_points(write_points(tmp_path, form, spoilt))
     assert (points == np.delete(POINTS, [3, 9], axis=0)).all()
     assert len(notes) == 1 and "2 of 50 points are not finite" in notes[0]
@@ -204,6 +202,7 @@ def test_files_of_no_points(form: str, tmp_path: Path) -> None:
         assert points.shape == (0, 3) and "holds no points" in notes[0]
 
 
+CUT = ply(POINTS, False).rpartition(b"\n" + text(POINTS[-1:], " "))[0]
 PACKED = PCD.format(n=10**9, data="binary_compressed").encode() + struct.pack("<II", 2, 40) + b"ab"
 
 
@@ -222,11 +221,7 @@ PACKED = PCD.format(n=10**9, data="binary_compressed").encode() + struct.pack("<
         ("cloud.pcd", PCD.replace("S {n}", "S -1").format(n=1, data="binary").encode(), "has -1 POINTS; it must be"),
         ("cloud.pcd", PCD.replace("TH {n}", "TH 9").format(n=1, data="binary").encode(), "must be WIDTH x HEIGHT, 9 x 1"),
         ("cloud.pcd", b"FIELDS x y z\nDATA ascii\n1 2 3\n", "is damaged: KeyError: 'POINTS'"),
-        (
-            "cloud.ply",
-            ply(POINTS, False).rpartition(b"\n" + text(POINTS[-1:], " "))[0],
-            "states 50 vertices, faces and other elements, but it holds 49",
-        ),
+        ("cloud.ply", CUT, "states 50 vertices, faces and other elements, but it holds 49"),
         ("cloud.csv", b"t,x,y\n0,1,2\n", "has the columns .'t', 'x', 'y'.; it must have x, y and z"),
         ("cloud.csv", b"time,Points:0,Points:1,Points:2\n5,1,2,3\n", "it must have x, y and z"),
         ("cloud.npy", npy(POINTS + 1j), "holds complex128 of 50 x 3; it must be numbers"),
@@ -290,7 +285,7 @@ def test_shapes_from_files_are_written_as_names_of_files(tmp_path: Path) -> None
     assert scene_entries(scene, None)[0]["mesh"]["file"] == str((tmp_path / "box.stl").resolve())
     assert_equal(scene, read_scene(written, tmp_path)[0])
     # regression: points that were replaced since were lost, since their old file was named
-    changed = rd.Scene([replace(scene.shapes[1], points=[[3.0, 2, 1]])])
+    changed = rd.Scene([replace(scene.shapes[1], points=[[3.0, 2, 1]])])  # type: ignore[type-var]
     assert read_scene(scene_entries(changed, tmp_path), tmp_path)[0].shapes[0].points.tolist() == [[3, 2, 1]]  # type: ignore
 
 

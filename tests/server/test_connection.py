@@ -39,17 +39,13 @@ def answer(server: httpx.Client, sent: bytes) -> tuple[int, Any]:
 
 
 RIGHT = b"Host: localhost\r\n"
+CHUNKED = b"Content-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n0x5\r\n{}\r\n"
 CASES = {
     "a host without its bracket": (b"GET /robots HTTP/1.1\r\nHost: [::1\r\n\r\n", 421, "the host is '[::1'"),
     "no HTTP": (b"hello\r\n\r\n", 400, "not an HTTP/1.1 request"),
     "a huge head": (b"GET / HTTP/1.1\r\n" + RIGHT + b"X: " + b"y" * 100_000, 400, "head is too large"),
     "a slash more": (b"GET /robots/ HTTP/1.1\r\n" + RIGHT + b"\r\n", 404, "there is no '/robots/'"),
-    "a damaged chunk": (
-        b"POST /plan HTTP/1.1\r\n" + RIGHT + b"Content-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n"
-        b"0x5\r\n{}\r\n",
-        400,
-        "not an HTTP/1.1 request",
-    ),
+    "a damaged chunk": (b"POST /plan HTTP/1.1\r\n" + RIGHT + CHUNKED, 400, "not an HTTP/1.1 request"),
 }
 
 

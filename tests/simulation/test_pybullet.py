@@ -47,8 +47,7 @@ def test_a_panda_tracks_a_timed_motion_the_better_the_finer_the_step() -> None:
     fine = replay(PANDA, rd.Scene(), trajectory, ReplaySettings(time_step=1 / 960))
     assert coarse.free and fine.free and coarse.times[-1] >= trajectory.duration + 0.25
     # with Bullet's default of 50 solver iterations, tips are off by up to 0.6 mm
-    assert coarse.max_errors.max() < 2e-5 and coarse.tip_errors.max() < 2e-5
-    assert (coarse.rms_errors <= coarse.max_errors).all()
+    assert coarse.max_errors.max() < 2e-5 and coarse.tip_errors.max() < 2e-5 and (coarse.rms_errors <= coarse.max_errors).all()
     assert 1e-7 < fine.max_errors.max() < coarse.max_errors.max() / 2
     assert coarse.positions[-1] == pytest.approx(trajectory.positions[-1], abs=1e-4)
     # the error of the tip against our own kinematics
@@ -86,8 +85,7 @@ def test_links_that_touch_each_other_are_reported() -> None:
     robot = box_arm()
     folding = motion(robot, np.zeros(3), np.array([0.0, 2.7, 2.0]))
     run = replay(robot, rd.Scene(), folding)
-    assert {(contact.link, contact.other) for contact in run.contacts} <= {("l1", "l3"), ("l3", "l1")}
-    assert not run.free
+    assert {(contact.link, contact.other) for contact in run.contacts} <= {("l1", "l3"), ("l3", "l1")} and not run.free
     allowed = replace(robot, allowed_collisions=robot.allowed_collisions | {frozenset(("l1", "l3"))})
     assert replay(allowed, rd.Scene(), folding).free
 
@@ -121,8 +119,7 @@ def test_a_world_that_fails_to_load_leaves_no_simulation(monkeypatch: pytest.Mon
     connect = world.pybullet.connect
     monkeypatch.setattr(world.pybullet, "connect", lambda mode: clients.append(connect(mode)) or clients[0])
     monkeypatch.setattr(world, "write_urdf", Mock(side_effect=OSError("no space left")))
-    with pytest.raises(rd.InputError, match="cannot be written: no space left"):
-        world.World(box_arm(), rd.Scene())
+    refuses("cannot be written: no space left", world.World, box_arm(), rd.Scene())
     assert not world.pybullet.isConnected(clients[0])
 
 
@@ -239,8 +236,7 @@ def test_paths_that_the_validator_accepts_or_refuses() -> None:
             if found is None:
                 assert report.violation.excess < 0.01
             else:
-                assert found.other == report.violation.other
-                assert found.at == pytest.approx(report.violation.time, abs=0.05)
+                assert found.other == report.violation.other and found.at == pytest.approx(report.violation.time, abs=0.05)
     assert 5 < sum(verdicts) < 25
 
 

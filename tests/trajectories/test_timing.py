@@ -75,10 +75,8 @@ def rates_agree(t: rd.Trajectory, robot: rd.Robot = ARM) -> bool:
 
 
 def check(q: np.ndarray, t: rd.Trajectory, settings: TimingSettings, robot: rd.Robot = ARM) -> None:
-    assert t.times[0] == 0 and (np.diff(t.times) > 0).all()
-    assert np.diff(t.times).max() <= 1.1 * settings.sample_time + 1e-9
-    assert np.array_equal(t.positions[0], q[0])
-    assert np.array_equal(t.positions[-1], q[-1]) and not t.velocities[[0, -1]].any()
+    assert t.times[0] == 0 and (np.diff(t.times) > 0).all() and np.diff(t.times).max() <= 1.1 * settings.sample_time + 1e-9
+    assert np.array_equal(t.positions[0], q[0]) and np.array_equal(t.positions[-1], q[-1]) and not t.velocities[[0, -1]].any()
     assert (np.abs(t.velocities) <= 1.01 * settings.velocity_scale * robot.velocity).all()
     assert (np.abs(t.accelerations) <= 1.01 * settings.acceleration_scale * robot.acceleration).all()
     # where a corner is narrow, smoothing for a limit of jerk leaves it by up to 0.03 rad more
@@ -149,8 +147,7 @@ def test_corner_is_rounded_when_valid_and_stopped_at_when_not() -> None:
     stopped = timed(q, never)
     assert timed(q).duration < 0.9 * stopped.duration
     nearest = np.linalg.norm(stopped.positions - q[1], axis=1).argmin()
-    assert np.array_equal(stopped.positions[nearest], q[1])
-    assert np.abs(stopped.velocities[nearest]).max() < 1e-9
+    assert np.array_equal(stopped.positions[nearest], q[1]) and np.abs(stopped.velocities[nearest]).max() < 1e-9
     assert distance_to_polyline(stopped.positions, q).max() < 1e-12
 
 
@@ -205,11 +202,9 @@ def test_a_limit_of_jerk_is_kept_with_the_others(seed: int, count: int, jerk: fl
     assert np.array_equal(t.positions[0], q[0]) and np.array_equal(t.positions[-1], q[-1])
     assert not t.velocities[[0, -1]].any() and np.abs(t.accelerations[[0, -1]]).max() < 1e-9
     # the jerk is constant between rows, so that limits hold at every time
-    q = t.positions
-    v = t.velocities
-    a = t.accelerations
+    p, v, a = t.positions, t.velocities, t.accelerations
     assert np.abs(v[:-1] + steps / 2 * (a[1:] + a[:-1]) - v[1:]).max() < 1e-9
-    assert np.abs(q[:-1] + steps * v[:-1] + steps**2 / 6 * (2 * a[:-1] + a[1:]) - q[1:]).max() < 1e-9
+    assert np.abs(p[:-1] + steps * v[:-1] + steps**2 / 6 * (2 * a[:-1] + a[1:]) - p[1:]).max() < 1e-9
     if stops:
         assert distance_to_polyline(t.positions, q).max() < 1e-8
 
@@ -339,8 +334,7 @@ def test_every_path_has_a_timing(seed: int, dof: int, count: int, scale: float, 
         q = np.cumsum(10 ** rng.uniform(-4, 0, (count, 1)) * rng.normal(0, 1, (count, dof)), axis=0)
     line = rounded_line(q, 10 ** rng.uniform(-4, 0, count - 2))
     grid = timing_grid(line, TimingSettings())
-    first = line(grid, 1)
-    second = line(grid, 2)
+    first, second = line(grid, 1), line(grid, 2)
     found = timing_kernel.fastest_speeds(first, second, grid, velocity, *symmetric_bounds(acceleration, len(grid)))
     assert (found[1:-1] > 0).all() and np.isfinite(found).all()
     assert (np.abs(first) * found[:, None] <= velocity * (1 + 1e-9)).all()
@@ -353,8 +347,7 @@ def test_every_path_has_a_timing(seed: int, dof: int, count: int, scale: float, 
         ours, least = ((2 * np.diff(grid) / (speeds[1:] + speeds[:-1])).sum() for speeds in (found, theirs))
         assert ours == pytest.approx(least, rel=1e-3)
     t = timed(q, robot=arm(tuple(velocity), tuple(acceleration)))
-    assert (np.abs(t.velocities) <= 1.01 * velocity).all()
-    assert (np.abs(t.accelerations) <= 1.01 * acceleration).all()
+    assert (np.abs(t.velocities) <= 1.01 * velocity).all() and (np.abs(t.accelerations) <= 1.01 * acceleration).all()
 
 
 @pytest.mark.parametrize("value", [1e-300, 1e-12, 1e-6, float("nan")])

@@ -24,8 +24,7 @@ def test_no_torque_leaves_its_chord_by_more_than_its_bound(name: str, step: floa
         for pieces in (trajectory_pieces(motion), static_pieces(motion.positions)):
             bulges = dynamics.second_derivatives(pieces.along) / 8
             piece = np.repeat(np.arange(len(bulges)), LOOKS)
-            torques = dynamics.torques(*pieces.states(piece, np.tile(u, len(bulges))))
-            torques = torques.reshape(len(bulges), LOOKS, -1)
+            torques = dynamics.torques(*pieces.states(piece, np.tile(u, len(bulges)))).reshape(len(bulges), LOOKS, -1)
             chords = torques[:, :1] + u[:, None] * (torques[:, -1:] - torques[:, :1])
             assert (np.abs(torques - chords).max(axis=1) <= bulges + 1e-9).all()
 
@@ -38,8 +37,7 @@ def test_a_peak_between_two_rows_is_found(effort: float, valid: bool) -> None:
     violation = rd.verify(problem, path).violation
     assert (violation is None) == valid
     if violation is not None:
-        assert violation.kind == "torque" and 0 < violation.time < 1
-        assert violation.message.startswith("hinge needs 9.8")
+        assert violation.kind == "torque" and 0 < violation.time < 1 and violation.message.startswith("hinge needs 9.8")
 
 
 def beyond(effort: float, pieces: Pieces) -> Excess | None:

@@ -69,8 +69,7 @@ def test_a_free_motion_is_accepted_with_a_certified_clearance() -> None:
 def test_an_empty_scene_and_a_motion_of_one_waypoint() -> None:
     report = validator(np.zeros((1, 3)))
     assert report.valid and report.min_clearance is not None and 0.2 < report.min_clearance < 0.4
-    assert report.scene_clearance == pytest.approx(1.0, abs=1e-4)
-    assert report.self_clearance == report.min_clearance
+    assert report.scene_clearance == pytest.approx(1.0, abs=1e-4) and report.self_clearance == report.min_clearance
     refused(validator(vector(1, 2.6, 2.6)[None]), "self_collision")
     assert validator(np.zeros((3, 3))).valid
 
@@ -145,8 +144,7 @@ def test_a_contact_with_two_obstacles_at_once_has_a_depth() -> None:
     shallow = rd.Sphere(vector(1.15, 0.12, 0), 0.1, "shallow")
     for shapes in ((deep, shallow), (shallow, deep)):
         found = refused(validator(np.array([[0, 0, 0], [-0.5, 0, 0]]), *shapes), "scene_collision")
-        assert (found.time, found.subject, found.other) == (0, "l3", "deep")
-        assert found.excess == pytest.approx(0.11, abs=0.003)
+        assert (found.time, found.subject, found.other) == (0, "l3", "deep") and found.excess == pytest.approx(0.11, abs=0.003)
 
 
 def test_self_collision_between_waypoints() -> None:
@@ -209,15 +207,9 @@ def test_twitching(spacing: float) -> None:
 def trajectory(duration: float) -> rd.Trajectory:
     """A smooth swing from rest to rest with this duration."""
     s = np.linspace(0, 1, 101)
-    way = 3 * s**2 - 2 * s**3
     span = SWING[1] - SWING[0]
-    return rd.Trajectory(
-        box_arm().joint_names,
-        s * duration,
-        SWING[0] + way[:, None] * span,
-        (6 * s - 6 * s**2)[:, None] * span / duration,
-        (6 - 12 * s)[:, None] * span / duration**2,
-    )
+    way, speed, push = (share[:, None] * span for share in (3 * s**2 - 2 * s**3, 6 * s - 6 * s**2, 6 - 12 * s))
+    return rd.Trajectory(box_arm().joint_names, s * duration, SWING[0] + way, speed / duration, push / duration**2)
 
 
 def strong(acceleration: float) -> rd.Robot:
@@ -363,20 +355,14 @@ def test_micro_steps_hide_no_acceleration(back: bool) -> None:
         place = 1e-3 * np.abs((quick.times / 1e-3 + 0.5) % 1 - 0.5)
         quick = replace(quick, positions=np.outer(place, [1.9, 0, 0]))
     found = wrong_rates(quick)
-    assert found.keys() == {"rates", "acceleration"}
-    assert "by its positions over 1 ms and more" in found["acceleration"]
+    assert found.keys() == {"rates", "acceleration"} and "by its positions over 1 ms and more" in found["acceleration"]
 
 
 def test_rows_far_apart_are_validated_as_controllers_move_between_them() -> None:
     """The arm moves out and back within one step: both rows of the step have equal positions."""
     robot = box_arm()
-    rows = np.zeros((4, 3))
-    speed = np.zeros((4, 3))
-    speed[1:3, 0] = 1.0, -1.0
-    rows[1:3, 0] = 0.5
-    rates = np.zeros((4, 3))
-    rates[:, 0] = 1.0, 0.0, -2.0, 2.0
-    out = rd.Trajectory(robot.joint_names, np.array([0.0, 1.0, 2.0, 3.0]), rows, speed, rates)
+    of_first_joint = [0, 0.5, 0.5, 0], [0, 1, -1, 0], [1, 0, -2, 2]
+    out = rd.Trajectory(robot.joint_names, np.arange(4.0), *(np.outer(values, [1.0, 0, 0]) for values in of_first_joint))
     assert verified(out).valid
     ball = rd.Sphere(1.1 * vector(np.cos(0.73), np.sin(0.73), 0), 0.02)
     assert 1.0 < refused(verified(out, ball), "scene_collision").time < 1.5
@@ -408,8 +394,7 @@ def between_rest(
     v = np.zeros_like(rows) if speeds is None else speeds
     bare = rd.Trajectory((robot or box_arm()).joint_names, np.array(times), rows, v, np.zeros_like(rows))
     start, end = bare.cubic_accelerations
-    a = (np.concatenate([start[:1], end]) + np.concatenate([start, end[-1:]])) / 2
-    return replace(bare, accelerations=a)
+    return replace(bare, accelerations=(np.concatenate([start[:1], end]) + np.concatenate([start, end[-1:]])) / 2)
 
 
 @pytest.mark.parametrize(("factor", "valid"), [(0.99, True), (1.03, False)])
@@ -451,11 +436,8 @@ def test_contacts_that_begin_together_are_all_listed_at_their_beginning() -> Non
 @given(st.floats(0.0, 1e-3), st.floats(1e-4, 3e-3))
 def test_clearance_is_that_of_the_cubic(bulge: float, gap: float) -> None:
     """Regression: 0.35 mm were certified, but the cubic, unlike the lines between the rows, was 0.29 mm inside the wall."""
-    rows = np.zeros((4, 3))
-    v = np.zeros((4, 3))
-    rows[0, 0] = rows[-1, 0] = -0.5
-    v[1, 0] = 4 * bulge
-    v[2, 0] = -4 * bulge
+    of_first_joint = [-0.5, 0, 0, -0.5], [0, 4 * bulge, -4 * bulge, 0]
+    rows, v = (np.outer(values, [1.0, 0, 0]) for values in of_first_joint)
     motion = between_rest(rows, [0.0, 2.0, 3.0, 5.0], v)
     wall = rd.Box(vector(1.1, 0.03 + 0.1 + gap, 0), vector(0.5, 0.2, 1.0))
     report = verified(motion, wall)
@@ -488,8 +470,7 @@ def test_resampled_motions_keep_the_accelerations() -> None:
     motion = time_parameterize(PANDA, rd.Path(PANDA.joint_names, rows), yes, yes).trajectory
     for rate in (30, 50, 125, 250, 1000):
         fewer = motion.resample(rate)
-        assert rd.verify(problem, fewer).valid
-        assert np.allclose(fewer.times[:-1] * rate, np.arange(len(fewer.times) - 1))
+        assert rd.verify(problem, fewer).valid and np.allclose(fewer.times[:-1] * rate, np.arange(len(fewer.times) - 1))
         assert fewer.duration <= motion.duration + 3 / rate
 
 
@@ -501,11 +482,8 @@ def test_the_line_of_a_violation_names_the_place_once() -> None:
 
 def test_eight_threads_validate_motions_of_one_problem() -> None:
     """Regression: threads shared objects of the proof that are not safe for threads."""
-    shapes = [
-        rd.Box((0.5, 0.1, 0.4), (0.2, 0.2, 0.2)),
-        rd.Cylinder((0.3, -0.5, 0.5), 0.1, 0.6),
-        rd.Sphere((-0.3, 0.4, 0.6), 0.15),
-    ]
+    ball = rd.Sphere((-0.3, 0.4, 0.6), 0.15)
+    shapes = [rd.Box((0.5, 0.1, 0.4), (0.2, 0.2, 0.2)), rd.Cylinder((0.3, -0.5, 0.5), 0.1, 0.6), ball]
     start = np.array([0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8])
     problem = rd.Problem(robot=PANDA, scene=rd.Scene(shapes), start=start, goal=start)
     ends = start + np.random.default_rng(0).uniform(-0.1, 0.1, (64, 1, PANDA.dof)) * (PANDA.upper - PANDA.lower)

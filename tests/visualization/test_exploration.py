@@ -61,9 +61,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def numbers(text: str) -> list[int]:
     """The numbers that the page decodes: differences in groups of 7 bits, the lowest bits first."""
     out = []
-    last = 0
-    value = 0
-    shift = 0
+    last = value = shift = 0
     for byte in base64.b64decode(text):
         value = value + ((byte & 127) << shift)
         shift = shift + 7

@@ -79,8 +79,7 @@ def test_creases_keep_edges_of_a_box_and_smooth_a_ball():
     assert len(box.vertices) == 24 and np.sort(np.abs(box.normals), axis=1)[:, :2].max() < 1e-12
     ball = trimesh.creation.icosphere(subdivisions=3)
     smooth = creased(ball.vertices.view(np.ndarray), ball.faces.view(np.ndarray), np.ones((len(ball.faces), 3)))
-    assert len(smooth.vertices) == len(ball.vertices)
-    assert (smooth.normals * smooth.vertices).sum(axis=1).min() > 0.999
+    assert len(smooth.vertices) == len(ball.vertices) and (smooth.normals * smooth.vertices).sum(axis=1).min() > 0.999
 
 
 def test_without_meshes_the_spheres_are_drawn(arm):

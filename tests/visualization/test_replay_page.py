@@ -35,8 +35,7 @@ def test_replay_holds_everything_and_loads_nothing(arm, scene, motion, tmp_path)
     assert len(data["times"]) == len(data["positions"]) == 121, "60 rows a second and no more"
     np.testing.assert_allclose(data["positions"][0], motion.positions[0], atol=1e-5)
     np.testing.assert_allclose(data["positions"][-1], motion.positions[-1], atol=1e-5)
-    assert dict(data["facts"])["clearance"] == "42.0 mm"
-    assert dict(data["facts"])["planner"] == "robotdiffuse · refinement"
+    assert dict(data["facts"])["clearance"] == "42.0 mm" and dict(data["facts"])["planner"] == "robotdiffuse · refinement"
     assert data["robot"]["spheres"] == [[3, 0.0, 0.0, 0.1, 0.12]] and file.stat().st_size < 800_000
     # The one address is the name of a namespace, which no browser opens.
     assert set(re.findall(r"https?://[^\s\"'`)]+", text)) <= {"http://www.w3.org/1999/xhtml"}
@@ -138,9 +137,6 @@ def test_of_several_goals_a_free_one_is_drawn(tmp_path: Path) -> None:
 
 
 def test_a_motion_of_other_joints_is_not_drawn(tmp_path: Path) -> None:
-    for motion in (
-        rd.Path(PANDA.joint_names[::-1], np.stack([START, GOAL])),
-        rd.Path(PANDA.joint_names, np.full((2, 7), np.nan)),
-    ):
+    for names, rows in ((PANDA.joint_names[::-1], np.stack([START, GOAL])), (PANDA.joint_names, np.full((2, 7), np.nan))):
         for write, name in ((write_picture, "a.png"), (write_replay, "a.html")):
-            refuses("^the motion (moves|has)", write, PANDA, rd.Scene(), motion, tmp_path / name)
+            refuses("^the motion (moves|has)", write, PANDA, rd.Scene(), rd.Path(names, rows), tmp_path / name)

@@ -85,7 +85,16 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.deadline import OutOfTimeError, check_time, deadline
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Bound, Count, Filled, Natural, NotNegative, Positive, Settings, Share
+from robotdiffuse.core.settings import (
+    AtLeastTwo,
+    Count,
+    Filled,
+    Natural,
+    NotNegative,
+    Positive,
+    Settings,
+    Share,
+)
 from robotdiffuse.core.types import Configurations, PlanResult
 from robotdiffuse.learning.diffusion import NoiseLevels, NoiseSchedule, reverse_process
 from robotdiffuse.learning.guidance import Trajectories
@@ -106,7 +115,7 @@ mean after gradient steps on the guide's costs."""
 class PriorSettings(LearnedSettings):
     samples: Count = 16
     """Number of trajectories in a batch."""
-    sampling_steps: Annotated[int, Bound(least=2.0)] = 25
+    sampling_steps: AtLeastTwo = 25
     """Number of denoising steps."""
     self_margin: NotNegative = 0.01
     """Distance between links below which there is a cost [m]."""
@@ -405,7 +414,7 @@ ENSEMBLE = tuple(
 class EDMPSettings(PriorSettings, name="edmp"):
     samples: Count = 24
     """Number of trajectories in a batch, divided evenly among the guides."""
-    sampling_steps: Annotated[int, Bound(least=2.0)] = 30
+    sampling_steps: AtLeastTwo = 30
     """Number of denoising steps; the noise levels are closer together where there is little noise."""
     push: Positive = 0.15
     """Longest move of a waypoint in one gradient step [rad, joint-space L2]."""

@@ -25,7 +25,7 @@ import numpy as np
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.settings import Count, NotNegative, Positive
-from robotdiffuse.core.types import Configuration, Configurations, PlanResult
+from robotdiffuse.core.types import Configuration, Configurations, PlanResult, nearest_first
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, scene_clouds
 from robotdiffuse.planning.start_goal import StartGoal
@@ -98,8 +98,7 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
         count = 1 if first else settings.batch
         space = search_space(start_goal.checker, settings.resolution)
         start, goals = start_goal.leads()
-        order = np.argsort(np.linalg.norm(goals - start, axis=1), kind="stable")
-        goal = goals[order[np.arange(tried, tried + count) % len(order)]]
+        goal = nearest_first(goals, start)[np.arange(tried, tried + count) % len(goals)]
         cloud = network.settings.region, network.settings.scene_points
         clouds = scene_clouds(start_goal.checker, *cloud, count, rng)
         motions = [_Motion(start, end) for end in goal]
@@ -159,6 +158,4 @@ class _Motion:
         reached."""
         if self.arrived:
             return start_goal.complete(np.stack(self.waypoints))
-        return np.concatenate(
-            [start_goal.start[None], np.stack(self.waypoints[1:] or self.waypoints).astype(np.float64)]
-        )
+        return np.vstack([start_goal.start, *(self.waypoints[1:] or self.waypoints)])

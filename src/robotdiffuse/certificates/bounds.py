@@ -13,6 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from numpy import ndarray
 
 from robotdiffuse.certificates.kinematics import Linkage, Postures
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.transforms import ball_around, rotation_from_quaternion
+from robotdiffuse.core.transforms import ball_around, placed_each, rotation_from_quaternion
 from robotdiffuse.core.types import (
     Configurations,
     JointRows,
@@ -32,6 +33,7 @@ from robotdiffuse.core.types import (
     Rotation,
     Values,
     Vector,
+    frozen_dataclass,
 )
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import MovingObstacle, Scene
@@ -69,7 +71,7 @@ class Rounded(NamedTuple):
         return n @ self.center + np.abs(local) @ self.half + self.disc * across + self.rounding
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Surface:
     """Triangles or points, inflated by a radius, with a spatial index."""
 
@@ -305,24 +307,21 @@ class Prover:
         self.q = q
         self.off = off
         self.linkage, self.obstacles = Linkage(robot), Obstacles(scene)
-        parts_of_links = {link: _parts(robot, link) for link in self.linkage.links}
-        self.parts = {link: parts for link, parts in parts_of_links.items() if parts}
-        self.links = [*self.parts]
-        if SCENE in self.links:
+        links = self.linkage.links
+        self.parts = {link: parts for link in links if (parts := _parts(robot, link))}
+        if SCENE in self.parts:
             raise InputError(
                 f"the robot has a link called {SCENE!r}; rename it: certificates use this name for the scene"
             )
-        self._link_index = {link: k for k, link in enumerate(self.linkage.links)}
+        self._link_index = {link: k for k, link in enumerate(links)}
         self._moved = self.linkage.moved
         self.may_touch = np.array(
-            [[scene.may_touch(link, name) for name in self.obstacles.names] for link in self.linkage.links],
-            bool,
-        ).reshape(len(self.linkage.links), len(self.obstacles.names))
+            [[scene.may_touch(link, name) for name in self.obstacles.names] for link in links], bool
+        ).reshape(len(links), len(self.obstacles.names))
         """[links, obstacles]: whether contact is allowed; such pairs are not checked."""
-        balls = [_balls(robot, link) for link in self.linkage.links]
+        balls = [_balls(robot, link) for link in links]
         self._balls = np.concatenate([np.zeros((0, 4)), *balls])
-        counts = [len(rows) for rows in balls]
-        self._first = np.cumsum([0, *counts])
+        self._first = np.cumsum([0, *map(len, balls)])
 
     def _links_of(self, claim: Claim) -> tuple[int, int]:
         """Indices of the two links of a claim; the base, which no joint moves, stands for the scene."""
@@ -332,14 +331,13 @@ class Prover:
     def claims(self) -> tuple[Claim, ...]:
         """All claims: each moving link against the scene, and each pair of links that move relative to each
         other and may not touch."""
-        moved = {link: self._moved[self._link_index[link]] for link in self.links}
+        moved = {link: self._moved[self._link_index[link]] for link in self.parts}
         level = {link: int(joints.sum()) for link, joints in moved.items()}
-        moving = [Claim(link, SCENE) for link in self.links if level[link] > 0]
+        moving = [Claim(link, SCENE) for link in self.parts if level[link] > 0]
         pairs = []
-        for i, a in enumerate(self.links):
-            for b in self.links[i + 1 :]:
-                if (moved[a] != moved[b]).any() and frozenset((a, b)) not in self.robot.allowed_collisions:
-                    pairs.append(Claim(a, b) if level[a] > level[b] else Claim(b, a))
+        for a, b in combinations(self.parts, 2):
+            if (moved[a] != moved[b]).any() and frozenset((a, b)) not in self.robot.allowed_collisions:
+                pairs.append(Claim(a, b) if level[a] > level[b] else Claim(b, a))
         return (*moving, *pairs)
 
     def at(self, places: Values) -> Configurations:
@@ -424,7 +422,7 @@ class Prover:
         row, ball, begin = self._expand(links)
         at = posture[row]
         radius = self._balls[ball, 3]
-        centers = _placed_points(postures.T[at, links[row]], self._balls[ball, :3])
+        centers = placed_each(postures.T[at, links[row]], self._balls[ball, :3])
         went = self.linkage.displacement(postures, at, centers, radius, moved[row], spans)
         clearance = np.full(len(links), CLEARANCE_CAP)
         if distances is not None:
@@ -468,7 +466,7 @@ class Prover:
         for first in range(0, len(at), step):
             some = slice(first, first + step)
             row, ball, begin = self._expand(link[some])
-            other_centers = _placed_points(postures.T[at[some][row], link[some][row]], self._balls[ball, :3])
+            other_centers = placed_each(postures.T[at[some][row], link[some][row]], self._balls[ball, :3])
             gaps = np.sqrt(((centers[some][row] - other_centers) ** 2).sum(axis=1)) - self._balls[ball, 3]
             distances[some] = np.minimum.reduceat(gaps, begin)
         return distances
@@ -575,10 +573,6 @@ def placed(parts: tuple[Part, ...], T: Pose) -> list[Part]:
     return [part._replace(vertices=part.vertices @ R.T + t, center=R @ part.center + t) for part in parts]
 
 
-def _placed_points(T: Float[ndarray, "n 4 4"], points: Points) -> Float[ndarray, "n 3"]:
-    return np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
-
-
 def _balls(robot: Robot, link: str) -> Float[ndarray, "n 4"]:
     """The spheres that cover a link; one sphere around its meshes if it has none."""
     spheres = robot.spheres.get(link, np.zeros((0, 4)))
@@ -624,7 +618,7 @@ class MovingProver(Prover):
     @cached_property
     def claims(self) -> tuple[Claim, ...]:
         """Each moving link against each obstacle."""
-        links = [link for link in self.links if self._moved[self._link_index[link]].any()]
+        links = [link for link in self.parts if self._moved[self._link_index[link]].any()]
         return tuple(Claim(link, obstacle.name) for link in links for obstacle in self.moving)
 
     def bounds(self, stretches: Stretches, by_planes: ndarray, planes: list[Plane]) -> Bounds:
@@ -635,8 +629,8 @@ class MovingProver(Prover):
         rows = np.arange(len(self.times))
         begin, at, end = (np.interp(s, rows, self.times) for s in (stretches.start, middle, stretches.stop))
         links = np.array([self._link_index[claim.link] for claim in self.claims])[stretches.claim]
-        number = {moving_obstacle.name: i for i, moving_obstacle in enumerate(self.moving)}
-        obstacle_indices = np.array([number[claim.against] for claim in self.claims])[stretches.claim]
+        numbers = [self.obstacles.names.index(claim.against) for claim in self.claims]
+        obstacle_indices = np.array(numbers)[stretches.claim]
         speed, known, reference_pose = (
             np.array(values)[obstacle_indices]
             for values in zip(
@@ -652,7 +646,7 @@ class MovingProver(Prover):
 
         def distances(row: ndarray, _: ndarray, centers: ndarray) -> Values:
             local = np.einsum("nji,nj->ni", T[row, :3, :3], centers - T[row, :3, 3])
-            obstacle_distances = self.obstacles.distances(_placed_points(reference_pose[row], local))
+            obstacle_distances = self.obstacles.distances(placed_each(reference_pose[row], local))
             return obstacle_distances[np.arange(len(row)), obstacle_indices[row]]
 
         posture = np.arange(len(obstacle_indices))

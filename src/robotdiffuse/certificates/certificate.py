@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable
-from dataclasses import MISSING, asdict, dataclass, fields
+from dataclasses import asdict, fields
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
@@ -16,16 +16,23 @@ from robotdiffuse.certificates.proof import DECIMALS, MotionProof, StretchProof,
 from robotdiffuse.core.errors import MAX_RATE, InputError, numbers, one_line, reading, shown, within
 from robotdiffuse.core.files import JsonObject, check_output, known_ending, read_json, write_atomically
 from robotdiffuse.core.settings import Number, converted
-from robotdiffuse.core.types import Path, Trajectory, check_motion_arrays
+from robotdiffuse.core.types import (
+    RATES,
+    Path,
+    Trajectory,
+    array_names,
+    check_motion_arrays,
+    frozen_dataclass,
+)
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.scenes.files import required_fields
 
 FILE_MARK = "robotdiffuse certificate"
 VERSION = 1
-RATE_ROWS = ("times", "velocities", "accelerations")
 STRETCH_FIELDS = ("start", "stop", "clearance", "displacement")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Certificate(MotionProof):
     """A motion and its proof, which can be checked and saved."""
 
@@ -83,7 +90,7 @@ def load_certificate(file: str | FilePath) -> Certificate:
     """
     known_ending(file, "certificate", (".json",))
     record = read_json(file)
-    if not is_certificate(record):
+    if not isinstance(record, dict) or record.get("is") != FILE_MARK:
         raise InputError(f"{file} is not a certificate; write one with `robotdiffuse verify --certificate`")
     with reading(file):
         if record.get("version") != VERSION:
@@ -101,14 +108,8 @@ def load_certificate(file: str | FilePath) -> Certificate:
         return Certificate(**values)
 
 
-def is_certificate(record: object) -> bool:
-    """Whether a JSON value is the content of a certificate file."""
-    return isinstance(record, dict) and record.get("is") == FILE_MARK
-
-
 def _motion_record(motion: Path | Trajectory) -> JsonObject:
-    arrays = ("positions", *(RATE_ROWS if isinstance(motion, Trajectory) else ()))
-    rows = {name: getattr(motion, name).tolist() for name in arrays}
+    rows = {name: getattr(motion, name).tolist() for name in array_names(motion)}
     return {"joint_names": list(motion.joint_names), **rows}
 
 
@@ -136,7 +137,7 @@ def _claim_record(proof: StretchProof, k: int, claim: Claim) -> JsonObject:
 
 
 def _motion(_: str, record: JsonObject) -> Path | Trajectory:
-    arrays = {name: record[name] for name in ("positions", *RATE_ROWS) if name in record}
+    arrays = {name: record[name] for name in ("positions", "times", *RATES) if name in record}
     names, checked = check_motion_arrays(record["joint_names"], arrays, "motion.")
     return Path(names, **checked) if len(checked) == 1 else Trajectory(names, **checked)
 
@@ -227,4 +228,4 @@ FIELDS = {
     "jerks": Field(_named_bounds),
 }
 """Fields of files after the mark and the version, in their order."""
-REQUIRED = {f.name for f in fields(MotionProof) if f.default is f.default_factory is MISSING}
+REQUIRED = required_fields(MotionProof)

@@ -91,9 +91,7 @@ def check(
         errors.append(f"robot: the problem has {problem.robot.name}, the certificate {certificate.robot}")
     if certificate.motion_hash != hash_of(certificate.motion):
         errors.append("motion: it is not the one that was certified: its hash differs")
-    with np.errstate(
-        over="ignore", invalid="ignore", divide="ignore"
-    ):  # non-finite values become differences
+    with np.errstate(all="ignore"):  # non-finite values become differences
         errors += _cover_errors(problem.robot)
         misplaced = place_errors(problem, certificate)
         errors += misplaced

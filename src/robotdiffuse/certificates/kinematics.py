@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.transforms import rotation_about
 from robotdiffuse.core.types import (
     Configurations,
     JointRows,
@@ -69,12 +68,7 @@ class Linkage:
             if j is not None:
                 origins[:, j] = T_base_joint[:, :3, 3]
                 axes[:, j] = T_base_joint[:, :3, :3] @ joint.axis
-            motion = np.tile(np.eye(4), (n, 1, 1))
-            if joint.kind == "prismatic":
-                motion[:, :3, 3] = value[:, None] * joint.axis
-            elif joint.kind != "fixed":
-                motion[:, :3, :3] = rotation_about(joint.axis, value[:, None, None])
-            at[joint.child] = T_base_joint @ motion
+            at[joint.child] = T_base_joint @ joint.motion(value)
         for k, name in enumerate(self.links):
             if name in at:
                 T[:, k] = at[name]

@@ -12,7 +12,7 @@ import numpy as np
 from robotdiffuse.certificates.bounds import Claim, Plane, Stretches
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Number, Settings
-from robotdiffuse.core.types import Mask, Path, Trajectory, Values
+from robotdiffuse.core.types import Mask, Path, Trajectory, Values, array_names, frozen_dataclass
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot, hashed_content
 from robotdiffuse.scenes.scene import Scene
@@ -50,7 +50,7 @@ class Tolerances(Settings):
     [m]."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class StretchProof:
     """Stretches (intervals) of the motion for each claim, with the bounds that prove each stretch free. A
     claim is that a link is free of the scene, of a moving obstacle or of another link."""
@@ -88,7 +88,7 @@ def joined(claims: tuple[Claim, ...], proofs: Iterable[StretchProof]) -> Stretch
     return StretchProof(claims, stretches, by_planes, clearance, displacement, tuple(planes))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class MotionProof:
     """A motion, what was proved of it, and the proof."""
 
@@ -180,23 +180,22 @@ def request_parts(problem: Problem) -> dict[str, str]:
         T_base = np.eye(4) if T_world_base is None else T_world_base
         parts["payload"] = _hash([carried.link, *links], payload_numbers, T_base, robot.effort, rows)
     for obstacle in problem.moving:
-        optional = (obstacle.velocity, obstacle.times, obstacle.poses, obstacle.max_speed)
-        motion = [np.zeros(0) if value is None else value for value in optional]
+        motion = (obstacle.velocity, obstacle.times, obstacle.poses, obstacle.max_speed)
         shape = obstacle.shape
         parts[f"moving {obstacle.name}"] = _hash(shape.kind, *_numbers(shape), *motion)
     for i, constraint in enumerate(problem.constraints):
         values = [getattr(constraint, f.name) for f in fields(constraint)]
         texts = [constraint.kind, *(value for value in values if isinstance(value, str))]
-        rows = [np.zeros(0) if value is None else value for value in values if not isinstance(value, str)]
+        rows = [value for value in values if not isinstance(value, str)]
         parts[f"constraints[{i}]"] = _hash(texts, *rows)
     return parts
 
 
 def hash_of(motion: Path | Trajectory) -> str:
     """Hash of a motion's exact numbers and joint names."""
-    rates = (motion.times, motion.velocities, motion.accelerations) if isinstance(motion, Trajectory) else ()
     digest = hashlib.sha256(json.dumps(list(motion.joint_names)).encode())
-    for array in (motion.positions, *rates):
+    for name in array_names(motion):
+        array = getattr(motion, name)
         digest.update(str(array.shape).encode() + np.ascontiguousarray(array, np.float64).tobytes())
     return digest.hexdigest()
 
@@ -222,4 +221,5 @@ def _numbers(shape: Shape) -> list[object]:
 
 
 def _hash(names: object, *numbers: object) -> str:
-    return hashlib.sha256(hashed_content(names, *numbers)).hexdigest()[:HASH_LENGTH]
+    given = [NOTHING if values is None else values for values in numbers]
+    return hashlib.sha256(hashed_content(names, *given)).hexdigest()[:HASH_LENGTH]

@@ -241,14 +241,15 @@ def _angle_bounds(along: _FrameMotion, chord: float, *ends: Pose) -> Values:
     """Upper bounds, for each step, on the angle between the frame's orientation and the orientation that is
     interpolated for its position on the line."""
     T_start, T_goal = ends
+    R_start = T_start[:3, :3]
     displacement = T_goal[:3, 3] - T_start[:3, 3]
     length = float(np.linalg.norm(displacement))
-    turn = T_goal[:3, :3] @ T_start[:3, :3].T
+    turn = T_goal[:3, :3] @ R_start.T
     total_angle = float(_angles(turn[None], np.eye(3))[0])
     axis = np.linalg.eigh(turn + turn.T)[1][:, -1]
     axis = axis if _skew(turn) @ axis >= 0 else -axis  # an eigenvector's sign is arbitrary
     if length < MIN_LINE_LENGTH:  # rotation in place: the nearest orientation between start and goal
-        turned = along.R @ T_start[:3, :3].T
+        turned = along.R @ R_start.T
         cosines = np.trace(turned, axis1=1, axis2=2) - turned @ axis @ axis
         angles = np.clip(np.arctan2(_skew(turned) @ axis, cosines), 0.0, total_angle)
         angle_per_length = 0.0
@@ -256,7 +257,7 @@ def _angle_bounds(along: _FrameMotion, chord: float, *ends: Pose) -> Values:
         fraction = np.clip((along.p - T_start[:3, 3]) @ displacement / length**2, 0.0, 1.0)
         angles = fraction * total_angle
         angle_per_length = total_angle / length
-    target_rotations = rotation_about(axis, angles[:, None, None]) @ T_start[:3, :3]
+    target_rotations = rotation_about(axis, angles[:, None, None]) @ R_start
     errors = _angles(along.R, target_rotations)
     return (errors[1:] + errors[:-1] + along.turn + angle_per_length * along.travel) / 2 + chord * (
         along.joints + angle_per_length * along.sensitivity
@@ -597,12 +598,9 @@ def _waypoint_errors(problem: Problem, motion: Path | Trajectory, tolerances: To
     robot = problem.robot
     after = 0.0
     for k, (goal, blend) in enumerate(zip(problem.waypoints, problem.blend, strict=True)):
-        rows = np.arange(len(motion.positions))
+        places = rows = np.arange(len(motion.positions), dtype=float)
         if isinstance(motion, Trajectory):
-            still = (np.abs(motion.velocities) <= tolerances.rest).all(axis=1)
-        else:
-            still = np.ones(len(rows), bool)
-        places = rows[still].astype(float)
+            places = rows[(np.abs(motion.velocities) <= tolerances.rest).all(axis=1)]
         if blend:
             # samples on the straight lines between rows, closer together than the blend is wide
             lengths = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1)

@@ -32,7 +32,7 @@ from robotdiffuse.certificates.bounds import (
     Surface,
     gaps,
 )
-from robotdiffuse.certificates.certificate import RATE_ROWS, Certificate
+from robotdiffuse.certificates.certificate import Certificate
 from robotdiffuse.certificates.kinematics import cubics_of, places_of
 from robotdiffuse.certificates.proof import (
     DECIMALS,
@@ -54,7 +54,7 @@ from robotdiffuse.certificates.requirements import (
 )
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.core.types import Path, Pose, Trajectory, Values
+from robotdiffuse.core.types import Path, Pose, Trajectory, Values, array_names
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose, coal_rounded
@@ -216,8 +216,8 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     if report.violation is not None:
         raise NotValidError(f"the motion is not valid: {report.violation.line}")
     # files hold float64; bounds of float32 rows, such as PyTorch's, would differ from the bounds checked
-    names = ("positions", *(RATE_ROWS if isinstance(motion, Trajectory) else ()))
-    motion = replace(motion, **{name: np.asarray(getattr(motion, name), np.float64) for name in names})
+    arrays = {name: np.asarray(getattr(motion, name), np.float64) for name in array_names(motion)}
+    motion = replace(motion, **arrays)
     required = {
         SCENE: CLEARANCE_SHARE * (report.scene_clearance or 0.0),
         "": CLEARANCE_SHARE * (report.self_clearance or 0.0),
@@ -226,7 +226,8 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     if problem.constraints:
         tolerances = replace(tolerances, chord=settings.constraint_chord)
     clearances = [c for c in (report.scene_clearance, report.self_clearance) if c]
-    reach = float(motion_radii(problem.robot).max(axis=0, initial=0.0).sum())
+    robot = problem.robot
+    reach = float(motion_radii(robot).max(axis=0, initial=0.0).sum())
     chord = min(tolerances.chord, CHORD_SHARE * min(clearances, default=np.inf) / max(reach, 1e-3))
     between = _between(motion, chord)
     bounds = torques = ()
@@ -239,29 +240,29 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
             "path constraints",
         )
     if problem.payload is not None:
-        allowed = problem.robot.effort * (1 + tolerances.rate_slack)
+        allowed = robot.effort * (1 + tolerances.rate_slack)
         samples, torques = _refined(
             motion,
             samples,
-            lambda places: (problem.robot.joint_names, torque_bounds(problem, motion, places), allowed),
+            lambda places: (robot.joint_names, torque_bounds(problem, motion, places), allowed),
             "torques",
         )
     q = configurations(motion, between)
     off = deviations(motion, between)
-    proof, margins = _prove(Prover(problem.robot, problem.scene, q, off), required)
+    proof, margins = _prove(Prover(robot, problem.scene, q, off), required)
     moving = None
     if problem.moving and isinstance(motion, Trajectory):
         times = places_of(motion, between)
-        moving, moving_margins = _prove(MovingProver(problem.robot, problem.moving, q, times, off), {"": 0.0})
+        moving, moving_margins = _prove(MovingProver(robot, problem.moving, q, times, off), {"": 0.0})
         # moving_margins[SCENE] is that of a moving obstacle with the name "scene", if there is one
         margins[SCENE] = min(margins[SCENE], *moving_margins.values())
     record = None
     with suppress(InputError):  # the robot may have been made in this program, and have no file
         record = problem_record(problem)
-    jerks = cubic_jerks(problem.robot, motion)
+    jerks = cubic_jerks(robot, motion)
     return Certificate(
-        problem.robot.name,
-        robot_parts(problem.robot),
+        robot.name,
+        robot_parts(robot),
         scene_parts(problem.scene),
         hash_of(motion),
         tolerances,

@@ -50,8 +50,7 @@ def compiling_ahead(picture: bool) -> Iterator[None]:
 def steps(robot: Robot, picture: bool) -> Iterator[Callable[[], object]]:
     """Calls that compile the code of the last stages of a plan, the slowest first. The compiled code serves
     all robots."""
-    middle = 0.5 * (robot.lower + robot.upper)
-    rows = np.stack([middle, middle + 0.01, middle])
+    rows = np.stack([robot.middle, robot.middle + 0.01, robot.middle])
     path = Path(robot.joint_names, rows)
     scene = Scene([BALL])
     from robotdiffuse.collision import CollisionChecker

@@ -161,9 +161,12 @@ def print_next_view(problem: "Problem", result: "PlanResult") -> None:
     from robotdiffuse.planning.exploration.viewpoints import next_view
 
     proposed = next_view(problem, result)
+    T = proposed.T_base_camera
+    if problem.T_world_base is not None:  # files then give cameras in the world's frame
+        T = problem.T_world_base @ T
     camera = ", ".join(
         f"{name}: [{', '.join(f'{number:.4g}' for number in numbers)}]"
-        for name, numbers in pose_entry(proposed.T_base_camera).items()
+        for name, numbers in pose_entry(T).items()
     )
     print(f"next view, which shows {100 * proposed.seen:.0f} % of the unknown space that the motion crosses:")
     print(f"  camera: {{{camera}}}")

@@ -137,7 +137,7 @@ def run_demo(arguments: Namespace) -> int:
         problem = replace(problem, scene=Scene([FLOOR]), views=(view,), unknown=PREDICTED)
     result = load_and_plan(problem, DEFAULT_PLANNER, picture=True, time_limit=TIME_LIMIT)
     print_result(result, asked_clearance(problem, DEFAULT_PLANNER))
-    if result.trajectory is None or result.path is None:
+    if result.trajectory is None:
         return NO_PLAN
     if arguments.camera:
         violation = verify(true_problem, result.path).violation

@@ -164,6 +164,6 @@ def print_robot(robot: Robot) -> None:
 
 
 def _place(T: Float[ndarray, "4 4"]) -> str:
-    wxyz = quaternion_from_rotation(T[:3, :3])
+    wxyz = quaternion_from_rotation(T)
     xyz = T[:3, 3]
     return " ".join(["xyz", *(f"{value:g}" for value in xyz), "wxyz", *(f"{value:.4g}" for value in wxyz)])

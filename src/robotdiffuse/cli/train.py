@@ -3,8 +3,6 @@
 import os
 import shutil
 import sys
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +24,7 @@ with needs("torch", "train"):
     from robotdiffuse.learning.training.config import (
         CONFIGS,
         EncoderTraining,
+        MotionTraining,
         PlannerTraining,
         one_length,
         planner_training,
@@ -38,36 +37,27 @@ with needs("torch", "train"):
         train_planner,
     )
 
-TRAINING_OPTIONS = (
-    *("minutes", "samples", "seed", "batch", "learning_rate", "threads"),
-    "checkpoint_seconds",
-)
-MODEL_OPTIONS = (
-    *("denoiser", "objective", "sampler", "sampling_steps", "target"),
-    *("condition_drop", "waypoints"),
-)
-"""Options of `train planner` that replace parts of its config."""
-
 
 def run_encoder(arguments: Namespace) -> None:
-    options = chosen(arguments, ("name", "scenes", "device", *TRAINING_OPTIONS))
-    settings = EncoderTraining(**one_length(options))
-    _check_folder(arguments.out)
-    _print_report(train_encoder(settings, arguments.out), arguments.out)
+    _train(arguments, EncoderTraining, train_encoder)
 
 
 def run_completion(arguments: Namespace) -> None:
-    options = chosen(arguments, ("families", "robot", "workers", "weights", "device", *TRAINING_OPTIONS))
-    settings = CompletionTraining(**one_length(options))
+    _train(arguments, CompletionTraining, train_completion)
+
+
+def _train(arguments: Namespace, kind: Any, train: Any) -> None:
+    """Train a network by the function `train`, with settings of the class `kind`."""
+    settings = kind(**one_length(chosen(arguments, kind.__dataclass_fields__)))
     _check_folder(arguments.out)
-    _print_report(train_completion(settings, arguments.out), arguments.out)
+    _print_report(train(settings, arguments.out), arguments.out)
 
 
 def run_planner(arguments: Namespace) -> None:
     if arguments.config not in CONFIGS:
         descriptions = [f"{name}: {config.description}" for name, config in CONFIGS.items()]
         raise InputError(f"unknown config {shown(arguments.config)}; known:", descriptions)
-    options = chosen(arguments, ("data", "encoder", "robot", "device", *TRAINING_OPTIONS, *MODEL_OPTIONS))
+    options = chosen(arguments, PlannerTraining.__dataclass_fields__)
     config = CONFIGS[arguments.config].changes
     if "denoiser" in options and config.get("denoiser_settings") is not None:
         # these settings are for the config's own denoiser; another gets its PAPER_SIZES, or its defaults
@@ -87,8 +77,7 @@ def run_planner(arguments: Namespace) -> None:
     if not arguments.data:
         if not arguments.robot:
             raise InputError("give --robot to generate data for an arm, or --data to use existing data")
-        make_settings = partial(planner_training, arguments.config)
-        common = arguments.robot, options, make_settings, arguments.out
+        common = arguments.robot, options, arguments.config, arguments.out
         report, weights = train_for_robot(*common, arguments.trajectories, arguments.workers)
         return _print_report(report, str(weights))
     if not arguments.out:
@@ -114,7 +103,7 @@ def run_planner(arguments: Namespace) -> None:
 
 
 def run_baseline(arguments: Namespace) -> None:
-    options = chosen(arguments, ("data", "robot", *TRAINING_OPTIONS))
+    options = chosen(arguments, MotionTraining.__dataclass_fields__)
     _check_folder(arguments.out)
     if arguments.name == "trajectory_prior":
         report = train_planner(planner_training(arguments.name, options), arguments.out)
@@ -185,7 +174,7 @@ def data_settings(source: str, robot: Robot, motions: int | None, seed: int | No
 def train_for_robot(
     source: str,
     options: dict[str, Any],
-    make_settings: Callable[[dict[str, Any]], PlannerTraining],
+    config: str,
     out: str | None = None,
     motions: int | None = None,
     workers: int | None = None,
@@ -193,9 +182,9 @@ def train_for_robot(
     """Generate the data, train, and install the weights; returns the training's figures and the weights'
     folder.
 
-    source: the robot, as for `load_robot`. options: training settings from the command line, which
-    `make_settings` completes. out: working folder; None: beside the user's robots. motions: number of motions
-    to generate; workers: number of processes that generate them.
+    source: the robot, as for `load_robot`. options: training settings from the command line, which change
+    those of `config`. out: working folder; None: beside the user's robots. motions: number of motions to
+    generate; workers: number of processes that generate them.
 
     Raises InputError for an unknown robot, a missing device or encoder, a folder that was made with other
     settings, and too little disk space.
@@ -211,8 +200,8 @@ def train_for_robot(
     defaults: dict[str, Any] = {"encoder": str(work / "encoder")}
     if options.get("minutes") is None:
         defaults["samples"] = SAMPLES
-    settings: PlannerTraining = make_settings(
-        defaults | options | {"data": str(work / "data"), "robot": source}
+    settings: PlannerTraining = planner_training(
+        config, defaults | options | {"data": str(work / "data"), "robot": source}
     )
     # raise InputError for a missing device or encoder now, before the data are generated
     Processes(settings.device)

@@ -16,7 +16,7 @@ from robotdiffuse.collision.kernels.convex_bounds import Hulls, Solids
 from robotdiffuse.core.transforms import ball_around, placed, transform
 from robotdiffuse.core.types import Points, Pose, Vector
 from robotdiffuse.robots.kinematic_tree import once_per_robot
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, moving_pairs
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
@@ -90,18 +90,9 @@ def checks_of(robot: Robot) -> tuple[Check, ...]:
     links = list(parts_of(robot))
     moving = (Check(link, None) for link in links if robot.link_frame(link) > 0)
     pairs = (
-        Check(a, b)
-        for i, a in enumerate(links)
-        for b in links[i + 1 :]
-        if robot.link_frame(a) != robot.link_frame(b) and frozenset((a, b)) not in robot.allowed_collisions
+        Check(*pair) for pair in moving_pairs(robot, links) if frozenset(pair) not in robot.allowed_collisions
     )
     return (*moving, *pairs)
-
-
-def surfaces_decide(robot: Robot, check: Check) -> bool:
-    """Whether two links are grazing (see `Robot.grazing`): where their convex parts touch, their mesh
-    surfaces decide whether the links collide."""
-    return check.other is not None and frozenset(check) in robot.grazing
 
 
 @once_per_robot
@@ -159,12 +150,10 @@ def _solid(shape: Shape) -> Solid | None:
             return Solid(shape, transform(shape.center), np.zeros(3), 0.0, shape.radius, False)
         case Box():
             return Solid(shape, shape.T_base_shape, shape.size / 2, 0.0, 0.0, False)
-        case Cylinder():
+        case Cylinder() | Capsule():
             half = np.array([0.0, 0.0, shape.height / 2])
-            return Solid(shape, shape.T_base_shape, half, shape.radius, 0.0, False)
-        case Capsule():
-            half = np.array([0.0, 0.0, shape.height / 2])
-            return Solid(shape, shape.T_base_shape, half, 0.0, shape.radius, False)
+            radii = (shape.radius, 0.0) if isinstance(shape, Cylinder) else (0.0, shape.radius)
+            return Solid(shape, shape.T_base_shape, half, *radii, False)
         case Triangulated():
             return _bounded(shape, shape.mesh.world_vertices, 0.0)
         case PointCloud():

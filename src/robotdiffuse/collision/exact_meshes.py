@@ -16,7 +16,7 @@ touching the surface.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import coal
 import numpy as np
@@ -34,12 +34,11 @@ from robotdiffuse.collision.convex_geometry import (
     parts_of,
     solid_arrays,
     solids_of,
-    surfaces_decide,
 )
 from robotdiffuse.collision.kernels import mesh_bounds as kernel
 from robotdiffuse.core.deadline import check_time
-from robotdiffuse.core.transforms import placed, transform
-from robotdiffuse.core.types import Configuration, Pose, Vector, for_kernels
+from robotdiffuse.core.transforms import placed, seen_from, transform
+from robotdiffuse.core.types import Configuration, Pose, Vector, for_kernels, frozen_dataclass
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose, coal_rounded, coal_surface
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
@@ -53,7 +52,7 @@ RAYS = np.array([[0.6137, 0.5291, 0.5861], [-0.7313, 0.3917, -0.5583], [0.1723, 
 an edge or a face."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class _Body:
     """The surface of a link, in the frame that the link is fixed to."""
 
@@ -83,12 +82,12 @@ class _Body:
         sides = [np.cross(edge_start, edge_end) @ ray for edge_start, edge_end in ((a, b), (b, c), (c, a))]
         through = np.all([side >= 0 for side in sides], axis=0) | np.all([side < 0 for side in sides], axis=0)
         normal = np.cross(b - a, c - a)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(all="ignore"):
             along = np.einsum("fd,fd->f", normal, a) / (normal @ ray)
         return self.component[through & (along > 0)]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class SurfacePair:
     """The surfaces of two links."""
 
@@ -106,7 +105,7 @@ class SurfacePair:
         if coal.collide(*places, coal.CollisionRequest(), coal.CollisionResult()):
             return None
         for body, T_body, other_body, T_other in ((a, T_a, b, T_b), (b, T_b, a, T_a)):
-            if body.inside((placed(T_other, other_body.points) - T_body[:3, 3]) @ T_body[:3, :3]).any():
+            if body.inside(seen_from(T_body, placed(T_other, other_body.points))).any():
                 return None
         result = coal.DistanceResult()
         if np.isfinite(cutoff):
@@ -120,7 +119,7 @@ def surface_pairs(robot: Robot) -> dict[Check, SurfacePair]:
     bodies: dict[str, _Body] = {}
     surfaces = {}
     for check in checks_of(robot):
-        if check.other is None or not surfaces_decide(robot, check):
+        if check.other is None or frozenset(check) not in robot.grazing:
             continue
         for link in (check.link, check.other):
             if link not in bodies:
@@ -190,10 +189,22 @@ class _Obstacle(NamedTuple):
     """The radius of each point of a point cloud [m]."""
 
 
+def _places(frames: ndarray, *bodies: _Piece | _Obstacle) -> list[Any]:
+    """The geometry and the pose of each body, as Coal takes them."""
+    places = []
+    for body in bodies:
+        if isinstance(body, _Obstacle):
+            pose = body.T
+        else:
+            T = frames[body.frame]
+            pose = coal_pose(T if body.T_frame_piece is None else T @ body.T_frame_piece)
+        places += [body.geometry, pose]
+    return places
+
+
 def forward_frames(robot: Robot, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n frames 4 4"]:
     """T_base_frame of frames 0 to dof, in float64 and independent of the PyTorch kinematics."""
-    slides = np.array(robot.prismatic, np.bool_)
-    return kernel.forward(for_kernels(robot.frame_offsets), robot.kernel_parents, slides, for_kernels(q))
+    return kernel.forward(*robot.kernel_joints, for_kernels(q))
 
 
 def _piece(part: Part) -> _Piece:
@@ -279,8 +290,7 @@ class ExactCollision:
         self.robot, self._solids = robot, solid_arrays(robot, scene)
         self._pieces, self._obstacles = _pieces(robot), _obstacles(scene)
         self.checks = checks_of(robot)
-        self.links = tuple(check.link for check in self.checks if check.other is None)
-        self.pairs = tuple((a, b) for a, b in self.checks if b is not None)
+        self._scene_checks = sum(check.other is None for check in self.checks)
         self._request = coal.DistanceRequest()
         self._request.enable_signed_distance = True
         self._first_contact, self._contacts = coal.CollisionRequest(), coal.CollisionRequest()
@@ -309,10 +319,6 @@ class ExactCollision:
             surface_pairs(self.robot).get(self.checks[check]),
         )
 
-    def _place(self, piece: _Piece, frames: ndarray) -> coal.Transform3s:
-        T = frames[piece.frame]
-        return coal_pose(T if piece.T_frame_piece is None else T @ piece.T_frame_piece)
-
     def _signed(
         self, piece: _Piece, other: _Piece | _Obstacle, frames: ndarray, cutoff: float, depth: bool
     ) -> float:
@@ -321,26 +327,22 @@ class ExactCollision:
 
         Without `depth`, the penetration of a surface may be too small, but the sign is right.
         """
-        T_piece = self._place(piece, frames)
+        places = _places(frames, piece, other)
         result = coal.DistanceResult()
-        if isinstance(other, _Piece):
-            T_other = self._place(other, frames)
-            return coal.distance(piece.geometry, T_piece, other.geometry, T_other, self._request, result)
-        if not other.surface:
-            return coal.distance(piece.geometry, T_piece, other.geometry, other.T, self._request, result)
+        if isinstance(other, _Piece) or not other.surface:
+            return coal.distance(*places, self._request, result)
         # For a penetrated surface, Coal's distance query is slow and returns the depth at an arbitrary
         # triangle, so the contacts are computed first.
         request = self._contacts if depth else self._first_contact
         hits = coal.CollisionResult()
-        coal.collide(piece.geometry, T_piece, other.geometry, other.T, request, hits)
+        coal.collide(*places, request, hits)
         if hits.isCollision():
             contacts = map(hits.getContact, range(hits.numContacts()))
             # Coal's penetration depths are negative
             return min([0.0, *(contact.penetration_depth for contact in contacts)]) - other.inflation
         if np.isfinite(cutoff):
             result.min_distance = cutoff + other.inflation
-        distance = coal.distance(piece.geometry, T_piece, other.geometry, other.T, self._request, result)
-        return distance - other.inflation
+        return coal.distance(*places, self._request, result) - other.inflation
 
     def nearest(
         self,
@@ -411,11 +413,11 @@ class ExactCollision:
 
     def link_distances(self, q: Configuration) -> tuple[Distance, ...]:
         """Signed distance of every moving link to the nearest obstacle [m], infinite in an empty scene."""
-        return self._all(q, range(len(self.links)))
+        return self._all(q, range(self._scene_checks))
 
     def pair_distances(self, q: Configuration) -> tuple[Distance, ...]:
         """Signed distance of every checked pair of links [m], negative where they overlap."""
-        return self._all(q, range(len(self.links), len(self.checks)))
+        return self._all(q, range(self._scene_checks, len(self.checks)))
 
     def distance_from_moved_base(self, link: str, q: Configuration, T: Pose) -> float:
         """Signed distance of a link to the nearest obstacle [m] after the whole robot, base included, is
@@ -456,10 +458,8 @@ class ExactCollision:
                 if isinstance(partner, _Obstacle) and partner.inflation > 0:
                     hit[row] = self._signed(piece, partner, frames[row], CLEAR_DISTANCE, depth=False) <= 0
                     continue
-                T_other = self._place(partner, frames[row]) if isinstance(partner, _Piece) else partner.T
-                T_piece = self._place(piece, frames[row])
                 result.clear()
-                coal.collide(piece.geometry, T_piece, partner.geometry, T_other, self._collide, result)
+                coal.collide(*_places(frames[row], piece, partner), self._collide, result)
                 hit[row] = result.isCollision()
                 if hit[row] and candidates.surfaces is not None:
                     distance = self._grazing_distance(candidates, frames[row], CLEAR_DISTANCE, depth=False)
@@ -472,7 +472,7 @@ class ExactCollision:
 def warm_up(robot: Robot) -> None:
     """Load Coal and build the robot's Coal objects now, so that later calls do not spend their time limit on
     this."""
-    explain_collision(robot, Scene([Sphere([0.0, 0.0, 100.0], 1.0)]), (robot.lower + robot.upper) / 2)
+    explain_collision(robot, Scene([Sphere([0.0, 0.0, 100.0], 1.0)]), robot.middle)
 
 
 def contacts_at(robot: Robot, scene: Scene, q: Configuration) -> list[Distance]:

@@ -15,13 +15,12 @@ from robotdiffuse.collision.convex_geometry import Solid, allowed_contacts, soli
 from robotdiffuse.collision.kernels.simd import W, by_sixteen
 from robotdiffuse.collision.point_cloud_grid import (
     NO_SPHERES,
-    PointGrid,
     build_grid,
     cover_triangles,
     join_to_few,
     thin_points,
 )
-from robotdiffuse.collision.sphere_pair_tables import build_pair_tables, no_tables
+from robotdiffuse.collision.sphere_pair_tables import NO_TABLES, build_pair_tables
 from robotdiffuse.core.deadline import check_time
 from robotdiffuse.core.transforms import moved_spheres, transform
 from robotdiffuse.robots.kinematic_tree import once_per_robot
@@ -127,25 +126,25 @@ def compile_robot(robot: Robot) -> RobotArrays:
     pairs = [(index[a], index[b]) for a, b in robot.checked_pairs() if a in index and b in index]
     arrays = RobotArrays(
         offsets=np.ascontiguousarray(offsets, np.float32),
-        spheres=np.concatenate(spheres).astype(np.float32) if spheres else np.zeros((0, 4), np.float32),
-        first=np.cumsum([0] + [len(s) for s in spheres]).astype(np.int32),
+        spheres=np.concatenate([NO_SPHERES, *spheres]).astype(np.float32),
+        first=np.cumsum([0, *map(len, spheres)]).astype(np.int32),
         # NO_SPHERES adds no row; it makes the array of a robot without spheres
         rows=np.concatenate([by_sixteen(row, row[-1:]) for row in [NO_SPHERES, *rows]]),
         row_bounds=np.array(
             [row for link_rows in placed_groups for row in link_rows.row_bounds], np.float32
         ).reshape(-1, 4),
-        row_sizes=np.array([len(row) for row in rows], np.int64),
-        first_row=np.cumsum([0] + [len(of_group) for of_group in clusters]).astype(np.int32),
+        row_sizes=np.array([*map(len, rows)], np.int64),
+        first_row=np.cumsum([0, *map(len, clusters)]).astype(np.int32),
         frame=np.array([robot.link_frame(link) for link in groups], np.int32),
         bounds=np.array([group.bounds for group in placed_groups], np.float32).reshape(-1, 4),
         pairs=np.array([(a, b, -1, 0) for a, b in pairs], np.int32).reshape(-1, 4),
-        pair_tables=no_tables(),
+        pair_tables=NO_TABLES,
         parents=robot.kernel_parents,
     )
     if not pairs:
         return arrays
     known = _known_tables(robot, pairs, groups)
-    pair_indices, tables = build_pair_tables(arrays, robot.lower, robot.upper, radii_of(robot, groups), known)
+    pair_indices, tables = build_pair_tables(arrays, robot, radii_of(robot, groups), known)
     return arrays._replace(pairs=pair_indices, pair_tables=tables)
 
 
@@ -332,14 +331,16 @@ def _cover(shape: PointCloud | Triangulated, reach: float) -> ndarray:
 
 
 @lru_cache(maxsize=8)
-def _grid_around(shapes: tuple[PointCloud | Triangulated, ...], reach: float, radius: float) -> PointGrid:
+def _grid_around(
+    shapes: tuple[PointCloud | Triangulated, ...], reach: float, radius: float
+) -> tuple[ndarray, ...]:
     """The grid of point clouds and meshes, cached, so that scenes with the same clouds and meshes share
     it."""
-    clouds: list[ndarray] = []
+    clouds = [NO_SPHERES]
     for i, shape in enumerate(shapes):
         points = sum(map(len, clouds))
         check_time(f"{len(shapes) - i} of {len(shapes)} meshes and clouds after {points:,} points")
         clouds.append(_cover(shape, reach))
-    cloud = np.concatenate(clouds) if clouds else NO_SPHERES
+    cloud = np.concatenate(clouds)
     check_time(f"the grid of {len(cloud):,} points", GRID_SECONDS_PER_POINT * len(cloud))
     return build_grid(cloud, radius)

@@ -26,7 +26,6 @@ from robotdiffuse.collision.convex_geometry import (
     checks_of,
     hulls_of,
     solid_arrays,
-    surfaces_decide,
 )
 from robotdiffuse.collision.kernel_arrays import compile_robot, compile_scene_for, robot_groups
 from robotdiffuse.collision.kernels import motion_certificate as kernel
@@ -45,7 +44,7 @@ from robotdiffuse.core.loading import loading
 from robotdiffuse.core.transforms import ball_around
 from robotdiffuse.core.types import Configurations, JointValues, for_kernels
 from robotdiffuse.robots.kinematic_tree import once_per_robot
-from robotdiffuse.robots.motion_bounds import motion_radii
+from robotdiffuse.robots.motion_bounds import motion_radii, radii_of
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
@@ -148,7 +147,7 @@ class ContinuousCollision:
         certified = np.full(2, CLEARANCE_CAP)  # smallest lower bound along the motion, of each of the two
         hit: tuple[float, int] | None = None  # place and check of the first contact
         while len(todo.start):
-            bounds, rows, columns = kernel.rounds(
+            bounds = kernel.rounds(
                 self.arm,
                 self.scene_arrays,
                 self.solids,
@@ -160,6 +159,7 @@ class ContinuousCollision:
                 self.tightness,
                 self.contact,
             )
+            rows, columns = np.nonzero(bounds.travel >= 0)
             if not len(rows):
                 break
             touched = self._ask(motion, bounds, rows, columns, best)
@@ -200,10 +200,8 @@ class ContinuousCollision:
         row_count = row + int(todo.stop[row] - todo.start[row] > 2 * CONTACT_TRAVEL_TOLERANCE)
         todo.stop[row] = middle[row]
         clearance[row:] = lower[row:] = -np.inf
-        piece_arrays = (todo.start, todo.stop, todo.undecided)
-        earlier = Round(
-            Pieces(*(part[:row_count] for part in piece_arrays)), *(part[:row_count] for part in bounds[1:])
-        )
+        pieces = Pieces(*(part[:row_count] for part in todo))
+        earlier = Round(pieces, *(part[:row_count] for part in bounds[1:]))
         return (float(middle[row]), int(columns[computed])), earlier
 
     @cached_property
@@ -230,72 +228,51 @@ class ContinuousCollision:
 
 
 @once_per_robot
-def _groups(robot: Robot) -> tuple[dict[str, int], dict[frozenset[str | None], int]]:
-    """Indices in the compiled arrays: of each link's group, and of each pair of links."""
-    groups = robot_groups(robot)
-    pairs = compile_robot(robot).pairs[:, :2].tolist()
-    return (
-        {link: i for i, link in enumerate(groups)},
-        {frozenset((groups[a], groups[b])): i for i, (a, b) in enumerate(pairs)},
-    )
-
-
-@once_per_robot
 def _arm(robot: Robot) -> Arm:
-    slides = np.array(robot.prismatic, np.bool_)
-    offsets = for_kernels(robot.frame_offsets)
-    return Arm(compile_robot(robot), hulls_of(robot)[0], offsets, robot.kernel_parents, slides)
+    return Arm(compile_robot(robot), hulls_of(robot)[0], *robot.kernel_joints)
 
 
 @once_per_robot
 def _checks(robot: Robot) -> Checks:
     """The checks as arrays for compiled code. Motion radii of a pair are relative to the frame of the last
     joint that moves both links: on one chain, the frame of the link nearer to the base."""
-    groups, pairs = _groups(robot)
     covered = with_covering_spheres(robot)
     parts = hulls_of(robot)[1]
-    links = [link for link in covered.link_names if link in covered.spheres]
-    radii = motion_radii(covered)
+    groups = robot_groups(robot)
+    # by link (with None) or pair of links, as in a Check: the index in RobotArrays
+    sphere_indices = {frozenset((link, None)): i for i, link in enumerate(groups)}
+    for i, (a, b) in enumerate(compile_robot(robot).pairs[:, :2].tolist()):
+        sphere_indices[frozenset((groups[a], groups[b]))] = i
     checks = checks_of(robot)
-    kind = []
-    group_indices = []
+    rows = []
     part_ranges = []
-    base = []
-    common = []
-    second = []
     check_radii = np.zeros((len(checks), robot.dof))
     for k, (link, partner) in enumerate(checks):
-        kind.append(SCENE if partner is None else PAIR)
-        group_index = groups.get(link, -1) if partner is None else pairs.get(frozenset((link, partner)), -1)
-        group_indices.append(group_index)
         nearer, farther = sorted((partner or robot.base, link), key=robot.link_frame)
         near_frame = robot.link_frame(nearer)
-        far_frame = robot.link_frame(farther)
-        shared = robot.moved_by[near_frame] & robot.moved_by[far_frame]
-        for member, joints in (
-            (nearer, robot.moved_by[near_frame] & ~shared),
-            (farther, robot.moved_by[far_frame] & ~shared),
-        ):
+        moved_by = robot.moved_by[[near_frame, robot.link_frame(farther)]]
+        shared = moved_by.all(axis=0)
+        moved_alone = moved_by & ~shared
+        for member, joints in zip((nearer, farther), moved_alone, strict=True):
             if joints.any():
-                check_radii[k, joints] = radii[links.index(member), joints]
-        base.append(near_frame)
-        common.append(int(np.flatnonzero(shared).max(initial=-1)) + 1)
-        second.append(
-            int(np.flatnonzero(robot.moved_by[far_frame] & ~shared)[0]) if common[-1] != near_frame else 0
-        )
+                check_radii[k, joints] = radii_of(covered, [member])[0, joints]
+        kind = SCENE if partner is None else PAIR
+        common = int(np.flatnonzero(shared).max(initial=-1)) + 1
+        second = int(moved_alone[1].argmax()) if common != near_frame else 0
+        sphere_index = sphere_indices.get(frozenset((link, partner)), -1)
+        rows.append((kind, sphere_index, near_frame, common, second))
         partner_parts = range(0) if partner is None else parts[nearer]
         part_ranges.append(
             (parts[farther].start, parts[farther].stop, partner_parts.start, partner_parts.stop)
         )
+    kinds, indices, *frames = np.array(rows, np.int64).reshape(-1, 5).T.copy()
     return Checks(
-        np.array(kind, np.int64),
-        np.array(group_indices, np.int64),
+        kinds,
+        indices,
         np.array(part_ranges, np.int64).reshape(-1, 4),
-        np.array(base, np.int64),
-        np.array(common, np.int64),
-        np.array(second, np.int64),
+        *frames,
         check_radii,
-        np.array([SURFACES_BELOW if surfaces_decide(robot, check) else 0.0 for check in checks]),
+        np.array([SURFACES_BELOW if frozenset(check) in robot.grazing else 0.0 for check in checks]),
     )
 
 

@@ -185,12 +185,10 @@ def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
     names = tuple(link for link in robot_groups(covered) if covered.link_frame(link) > 0)
     spheres = [moved_spheres(covered.T_frame_link(link), covered.spheres[link]) for link in names]
     links = Links(
-        for_kernels(robot.frame_offsets),
-        robot.kernel_parents,
-        np.array(robot.prismatic, np.bool_),
+        *robot.kernel_joints,
         np.array([covered.link_frame(link) for link in names], np.int64),
         np.array(bounding_spheres(spheres)).reshape(-1, 4),
-        np.cumsum([0] + [len(link_spheres) for link_spheres in spheres]),
+        np.cumsum([0, *map(len, spheres)]),
         np.concatenate(spheres) if spheres else np.zeros((0, 4)),
         radii_of(covered, names),
     )
@@ -199,20 +197,16 @@ def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
 
 def compile_tracks(moving: Sequence[MovingObstacle]) -> Tracks:
     """The arrays of moving obstacles for compiled code. A mesh is represented by its bounding box."""
-    times = []
-    xyz = []
-    wxyz = []
-    speeds = []
+    # times, positions, quaternions and speeds of each obstacle, after those of none
+    tracks = [(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0))]
     solids = list[Solid]()
     for obstacle in moving:
         at, poses = obstacle.track
-        quaternions = np.stack([quaternion_from_rotation(T[:3, :3]) for T in poses])
+        quaternions = np.stack([quaternion_from_rotation(T) for T in poses])
         for i in range(1, len(quaternions)):
             quaternions[i] *= 1.0 if quaternions[i] @ quaternions[i - 1] >= 0 else -1.0
-        times.append(at)
-        xyz.append(poses[:, :3, 3])
-        wxyz.append(quaternions)
-        speeds.append(np.append(track_speeds(at, poses, obstacle.radius), 0.0))
+        speeds = np.append(track_speeds(at, poses, obstacle.radius), 0.0)
+        tracks.append((at, poses[:, :3, 3], quaternions, speeds))
         solids += solids_of(Scene([obstacle.shape]))
     boxes = [
         inverse(obstacle.shape.T_base_shape) @ solid.T_base_box
@@ -222,11 +216,8 @@ def compile_tracks(moving: Sequence[MovingObstacle]) -> Tracks:
     # these are the half edges of a larger box, aligned with the obstacle's frame, that contains it.
     half_edges = [np.abs(T[:3, :3]) @ solid.half for T, solid in zip(boxes, solids, strict=True)]
     return Tracks(
-        np.cumsum([0] + [len(at) for at in times]),
-        np.concatenate([np.zeros(0), *times]),
-        np.concatenate([np.zeros((0, 3)), *xyz]),
-        np.concatenate([np.zeros((0, 4)), *wxyz]),
-        np.concatenate([np.zeros(0), *speeds]),
+        np.cumsum([len(times) for times, *_ in tracks]),
+        *map(np.concatenate, zip(*tracks, strict=True)),
         np.array([obstacle.max_speed or 0.0 for obstacle in moving]),
         np.array([T[:3, 3] for T in boxes]).reshape(-1, 3),
         np.array(half_edges).reshape(-1, 3),

@@ -1,14 +1,13 @@
 """Covering spheres of point clouds and meshes, and the grid over these spheres, which
 `kernels/point_grid.py` queries."""
 
-from typing import NamedTuple
-
 import numpy as np
-from jaxtyping import Float, Float32, Int, Int32
+from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.point_grid import POINT_RANGE, make_grid
 from robotdiffuse.collision.kernels.simd import by_sixteen
+from robotdiffuse.core.transforms import scaled_normals
 from robotdiffuse.robots.fitting.triangles import split
 
 MESH_SPACING = 0.02
@@ -32,17 +31,6 @@ voxels."""
 MAX_VOXELS = 1e6
 """Approximate largest number of voxels of a grid: 4 MB, which fits a processor's cache."""
 NO_SPHERES = np.zeros((0, 4))
-
-
-class PointGrid(NamedTuple):
-    """The fields of SceneArrays of the same names."""
-
-    points: Float32[ndarray, "n 4"]
-    point_rows: Float32[ndarray, "rows 64"]
-    cell_first: Int32[ndarray, "cells"]
-    grid: Float32[ndarray, "voxels"]
-    nearest: Int32[ndarray, "voxels"]
-    grid_frame: Float32[ndarray, "14"]
 
 
 def thin_points(points: Float[ndarray, "n 3"], radius: float, reach: float) -> Float[ndarray, "m 4"]:
@@ -104,15 +92,14 @@ def cover_triangles(triangles: Float[ndarray, "n 3 3"], reach: float) -> Float[n
 
 
 def _area(triangles: Float[ndarray, "n 3 3"]) -> float:
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    return float(np.linalg.norm(normals, axis=1).sum() / 2)
+    return float(np.linalg.norm(scaled_normals(triangles), axis=1).sum() / 2)
 
 
-def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
-    """The grid over the covering spheres `cloud` of obstacles. `radius` is that of the robot's largest sphere
-    [m]."""
+def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> tuple[ndarray, ...]:
+    """The grid over the covering spheres `cloud` of obstacles: the fields of SceneArrays from `points` to
+    `grid_frame`. `radius` is that of the robot's largest sphere [m]."""
     if not len(cloud):
-        return PointGrid(
+        return (
             NO_SPHERES.astype(np.float32),
             by_sixteen(NO_SPHERES, NO_SPHERES),
             np.zeros(2, np.int32),
@@ -131,7 +118,7 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     cells = (shape + 1) // 2
     # points sorted by cell, then by voxel within the cell
     index = ((cloud[:, :3] - low) / voxel).astype(np.int64)
-    cell = _flat(index // 2, cells)
+    cell = np.ravel_multi_index((index // 2).T, cells.tolist())
     order = np.argsort(cell * 8 + (index % 2) @ np.array([4, 2, 1]))
     points = np.ascontiguousarray(cloud[order])
     index = index[order]
@@ -140,7 +127,7 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     # distance up to which the grid is exact [m], enough to decide whether the largest sphere touches a point
     band = np.float32(max(radius + float(radii.max()) + 1e-3, 2 * float(voxel)))
     # runs of points in the same voxel
-    voxels = _flat(index, shape)
+    voxels = np.ravel_multi_index(index.T, shape.tolist())
     starts = np.flatnonzero(np.diff(voxels, prepend=-1))
     run = np.full(int(np.prod(shape)), -1, np.int32)
     run[voxels[starts]] = np.arange(len(starts))
@@ -148,11 +135,4 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     sizes = tuple(shape.tolist())
     grid, nearest = make_grid(points, run_starts, run, low, voxel, sizes, band, np.float32(exact_distance))
     frame = [*low, voxel, 2 * voxel, radii.max(), radii.min(), band, *shape, *cells]
-    return PointGrid(
-        points, by_sixteen(points, points[-1:]), first, grid, nearest, np.array(frame, np.float32)
-    )
-
-
-def _flat(index: Int[ndarray, "n 3"], shape: Int32[ndarray, "3"]) -> Int[ndarray, "n"]:
-    """Row-major index of each voxel."""
-    return (index[:, 0] * int(shape[1]) + index[:, 1]) * int(shape[2]) + index[:, 2]
+    return points, by_sixteen(points, points[-1:]), first, grid, nearest, np.array(frame, np.float32)

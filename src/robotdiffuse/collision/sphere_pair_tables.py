@@ -16,7 +16,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernels.lane_clearance import pair_clearances
 from robotdiffuse.collision.kernels.lane_collision import TABLE_HEADER, TABLE_SIDE
-from robotdiffuse.robots.robot import LinkPairTable
+from robotdiffuse.robots.robot import LinkPairTable, Robot
 
 CELLS_PER_JOINT = TABLE_SIDE - 2
 """Number of cells along each joint's range; one more cell at each end stands for values beyond the range."""
@@ -27,15 +27,12 @@ ROUNDING_SLACK = 1e-5
 """Upper bound on the rounding error of a distance [m]."""
 
 
-def no_tables() -> Float32[ndarray, "0 width"]:
-    """An array of no tables."""
-    return np.zeros((0, TABLE_HEADER + TABLE_SIDE**2), np.float32)
+NO_TABLES = np.zeros((0, TABLE_HEADER + TABLE_SIDE**2), np.float32)
 
 
 def build_pair_tables(
     arrays: Any,
-    lower: Float[ndarray, "dof"],
-    upper: Float[ndarray, "dof"],
+    robot: Robot,
     radii: Float[ndarray, "groups dof"],
     known: Mapping[int, LinkPairTable],
 ) -> tuple[Int32[ndarray, "pairs 4"], Float32[ndarray, "tables width"]]:
@@ -48,17 +45,18 @@ def build_pair_tables(
 
     Args:
         arrays: The RobotArrays without tables.
-        lower: Lower joint limits.
-        upper: Upper joint limits.
+        robot: The robot.
         radii: Upper bounds on how far a point of each group moves per unit of each joint [m].
         known: Tables of convex parts for some of the pairs, by index of the pair.
 
     Returns:
         The rows of `RobotArrays.pairs` and the tables.
     """
-    parents = np.arange(len(lower)) if arrays.parents is None else arrays.parents
+    lower = robot.lower
+    upper = robot.upper
+    parents = robot.parents
     pair_rows = arrays.pairs.copy()
-    tables = [no_tables()]
+    tables = [NO_TABLES]
     pairs_by_joint: dict[int, list[int]] = {}
     for p, (a, b) in enumerate(arrays.pairs[:, :2].tolist()):
         near, far = sorted((int(arrays.frame[a]), int(arrays.frame[b])))

@@ -8,8 +8,8 @@ from contextvars import ContextVar
 LONG = 0.2
 """A step shorter than this [s] begins as long as any time is left. Such a step of timing (the time
 parameterization) may begin up to this long after the time limit."""
-_remaining: ContextVar[Callable[[], float] | None] = ContextVar("remaining", default=None)
-_cancel_check: ContextVar[Callable[[], None] | None] = ContextVar("cancel_check", default=None)
+_remaining: ContextVar[Callable[[], float]] = ContextVar("remaining", default=lambda: float("inf"))
+_cancel_check: ContextVar[Callable[[], None]] = ContextVar("cancel_check", default=lambda: None)
 # Work for which too little time is left; the words end the message "the time limit is too short ...".
 PREPARING = "to prepare the scene"
 TIMING = "for timing"
@@ -50,9 +50,7 @@ def cancel_check(check: Callable[[], None]) -> Iterator[None]:
 
 def check_cancelled() -> None:
     """Raise the exception of `cancel_check` if the call is cancelled."""
-    check = _cancel_check.get()
-    if check is not None:
-        check()
+    _cancel_check.get()()
 
 
 def check_timing(step: str, seconds: float = 0.0) -> None:
@@ -61,20 +59,18 @@ def check_timing(step: str, seconds: float = 0.0) -> None:
     Planners reserve time for timing (`PlanningContext.search_until`), so timing rarely exceeds the limit. The
     overrun allows a planner to return a path that was found late.
     """
-    _check(step, seconds, TIMING, LONG)
+    check_time(step, seconds, TIMING)
 
 
-def check_time(step: str, seconds: float = 0.0) -> None:
+def check_time(step: str, seconds: float = 0.0, what: str = PREPARING) -> None:
     """Raise OutOfTimeError if no time is left, or not enough for a step that takes about `seconds` [s]; see
-    LONG for short steps. Raises as `check_cancelled` does if the call is cancelled."""
-    _check(step, seconds, PREPARING, 0.0)
+    LONG for short steps. Raises as `check_cancelled` does if the call is cancelled.
 
-
-def _check(step: str, seconds: float, what: str, overrun: float) -> None:
+    what: PREPARING or TIMING, the work that the step is part of.
+    """
     check_cancelled()
-    get_remaining = _remaining.get()
-    remaining = float("inf") if get_remaining is None else get_remaining()
-    if remaining <= -overrun:
+    remaining = _remaining.get()()
+    if remaining <= (-LONG if what == TIMING else 0.0):
         raise OutOfTimeError(step, what)
     if seconds > max(LONG, remaining):
         raise OutOfTimeError(f"{step}, which takes about {seconds:.1f} s", what)

@@ -113,8 +113,6 @@ def input_file(file: str | Path, what: str = "", largest: int = MAX_FILE_SIZE) -
         raise InputError(f"{named} does not exist") from None
     except OSError as error:
         raise InputError(f"{named} cannot be read: {error.strerror}") from None
-    except ValueError:  # a NUL or half a surrogate pair in the name
-        raise InputError(f"{named} is not a valid file name") from None
     if not stat.S_ISREG(status.st_mode):
         kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device or a pipe"
         raise InputError(f"{named} cannot be read: it is {kind}; it must be a file")
@@ -199,7 +197,7 @@ def parse_json(text: str, where: str) -> Any:
     try:
         return json.loads(
             text,
-            parse_int=lambda digits: _integer(digits, where),
+            parse_int=lambda digits: int(_checked_digits(digits, where)),
             object_pairs_hook=lambda pairs: _object(pairs, where),
         )
     except json.JSONDecodeError as error:
@@ -346,7 +344,7 @@ class _Composer:
         if kind not in ("null", "bool", "float", "int"):
             return text
         if kind == "int":
-            _check_digits(text, self.where)
+            _checked_digits(text, self.where)
         try:
             return getattr(self.loader, f"construct_yaml_{kind}")(yaml.ScalarNode("", text))
         except ValueError:  # 0x_ has no digits
@@ -371,14 +369,10 @@ def _object(pairs: list[tuple[str, Any]], where: str) -> JsonObject:
     return mapping
 
 
-def _integer(digits: str, where: str) -> int:
-    _check_digits(digits, where)
-    return int(digits)
-
-
-def _check_digits(text: str, where: str) -> None:
+def _checked_digits(text: str, where: str) -> str:
     if len(text) > MAX_DIGITS:
         raise InputError(f"{where} holds the integer {shortened(text)}; no field takes such a large number")
+    return text
 
 
 def _too_deep(where: str) -> NoReturn:

@@ -20,20 +20,15 @@ from numba.core import caching, errors, event
 
 from robotdiffuse.core import loading
 
-
-def _without_scipy(module: str) -> None:
-    """Import a module of Numba while SciPy cannot be imported. Numba needs SciPy there only to choose an
-    algorithm for `np.convolve`."""
-    blas = "scipy.linalg.cython_blas"
-    if blas not in sys.modules:
-        sys.modules[blas] = None  # pyright: ignore[reportArgumentType]  (makes the import fail)
-        try:
-            import_module(module)
-        finally:
-            del sys.modules[blas]
-
-
-_without_scipy("numba.np.arraymath")  # importing SciPy would take 11 % of the time of a `plan` command
+# Numba imports SciPy in this module only to choose an algorithm for `np.convolve`. It would take 11 % of the
+# time of a `plan` command, so the import is made to fail.
+BLAS = "scipy.linalg.cython_blas"
+if BLAS not in sys.modules:
+    sys.modules[BLAS] = None  # pyright: ignore[reportArgumentType]
+    try:
+        import_module("numba.np.arraymath")
+    finally:
+        del sys.modules[BLAS]
 
 # Type inference meets thousands of errors in a large function. For each, Numba would let colorama replace
 # sys.stdout and sys.stderr and then restore them, even if another thread has replaced them in the meantime.

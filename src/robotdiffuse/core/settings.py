@@ -16,6 +16,7 @@ import math
 import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -24,7 +25,7 @@ from types import UnionType
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from robotdiffuse.core.errors import InputError, shortened, shown, suggestion, unknown_name
-from robotdiffuse.core.files import parse_yaml
+from robotdiffuse.core.files import JsonObject, parse_yaml
 from robotdiffuse.core.registry import Registry
 
 SettingsT = TypeVar("SettingsT", bound="Settings")
@@ -54,7 +55,7 @@ class Bound:
             return "positive" if self.rule == "above 0" else self.rule or "finite"
         return "finite" if math.isinf(value) and not self.infinite else None
 
-    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> JsonObject:
         keywords = {
             "exclusiveMinimum": self.above,
             "minimum": self.least,
@@ -78,7 +79,7 @@ class OneOf:
 
     names: Iterable[str]
 
-    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> JsonObject:
         return handler(schema) | {"enum": list(self.names)}
 
 
@@ -105,7 +106,9 @@ Number = Annotated[float, Bound()]
 Positive = Annotated[float, Bound(above=0.0)]
 NotNegative = Annotated[float, Bound(least=0.0)]
 Share = Annotated[float, Bound(least=0.0, most=1.0)]
+ShareBelowOne = Annotated[float, Bound(least=0.0, below=1.0)]
 Count = Annotated[int, Bound(least=1.0)]
+AtLeastTwo = Annotated[int, Bound(least=2.0)]
 Natural = Annotated[int, Bound(least=0.0)]
 Sizes = Annotated[tuple[Count, ...], Filled()]
 """Layer sizes; at least one."""
@@ -170,7 +173,7 @@ class Settings:
         for name, hint in _hints(type(self)).items():
             object.__setattr__(self, name, converted(prefix + name, hint, getattr(self, name), self))
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Convert the settings to plain JSON values.
 
         Returns:
@@ -203,13 +206,11 @@ class Settings:
         for name, field in fields.items():
             if name in values:
                 at = f"{where}.{name}"
+                value = values[name]
                 # None needs no class: the field that `SettingsOf` names then holds a folder, which has no
                 # registry entry.
-                kind = None if values[name] is None else _settings_class(hints[name], values, fields)
-                if kind is not None:
-                    checked[name] = kind.from_json(values[name], at)
-                else:
-                    checked[name] = converted(at, hints[name], values[name])
+                kind = None if value is None else _settings_class(hints[name], values, fields)
+                checked[name] = kind.from_json(value, at) if kind else converted(at, hints[name], value)
             elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
                 raise InputError(f"{where}.{name} is missing")
         return cls(**checked)
@@ -234,13 +235,13 @@ class Settings:
             name, equals, value = text.partition("=")
             if not equals or not name:
                 raise InputError(f"{shown(text)} is not NAME=VALUE; {owner} has {valid_assignments}")
-            try:
+            parsed: Any = value
+            with suppress(InputError):
                 parsed = parse_yaml(value, name)
-            except InputError:
-                parsed = value
             if isinstance(parsed, str):
                 # YAML 1.1 reads 1e-3 as a string, and does not know none as null
-                parsed = None if parsed == "none" else _number(parsed)
+                with suppress(ValueError):
+                    parsed = None if parsed == "none" else float(parsed)
             values[name] = parsed
         return self.replaced(values)
 
@@ -395,13 +396,6 @@ def _settings_class(
         if isinstance(member, type) and issubclass(member, Settings):
             return member
     return None
-
-
-def _number(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text
 
 
 def _rule(hint: Any) -> str:

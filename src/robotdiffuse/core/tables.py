@@ -67,7 +67,7 @@ class Table:
     ) -> "Table":
         """Make a table; a column can be given by its heading."""
         of_columns = (Column(column) if isinstance(column, str) else column for column in columns)
-        return cls(title, tuple(of_columns), tuple(tuple(row) for row in rows), tuple(notes))
+        return cls(title, tuple(of_columns), tuple(map(tuple, rows)), tuple(notes))
 
     @classmethod
     def pairs(cls, title: str, rows: Sequence[tuple[str, str]]) -> "Table":
@@ -146,16 +146,16 @@ def terminal(table: Table) -> "RichTable":
     return rich_table
 
 
-def show(*tables: Table, width: int | None = None) -> None:
+def show(*tables: Table) -> None:
     """Print tables as wide as the terminal, or as WIDTH without one."""
     # Tables of pairs are printed without rich: importing it takes longer than planning a motion.
     if all(len(table.columns) == 2 and not table.headed for table in tables):
-        columns = width or (shutil.get_terminal_size().columns if sys.stdout.isatty() else WIDTH)
+        columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else WIDTH
         print("\n\n".join("\n".join(pair_lines(table, columns)) for table in tables))
         return
     from rich.console import Console
 
-    console = Console(width=width or (None if sys.stdout.isatty() else WIDTH))
+    console = Console(width=None if sys.stdout.isatty() else WIDTH)
     for i, table in enumerate(tables):
         console.print(*([""] if i else []), terminal(table), sep="\n")
 

@@ -34,8 +34,9 @@ def _rotation(w: Any, x: Any, y: Any, z: Any) -> list[list[Any]]:
     ]
 
 
-def quaternion_from_rotation(rotation: Rotation) -> Float[ndarray, "4"]:
-    """Unit quaternion wxyz with w >= 0 of a rotation matrix (Bar-Itzhack's eigenvector method)."""
+def quaternion_from_rotation(rotation: Rotation | Pose) -> Float[ndarray, "4"]:
+    """Unit quaternion wxyz with w >= 0 of a rotation matrix, or of the rotation of a pose (Bar-Itzhack's
+    eigenvector method)."""
     r = rotation
     k = np.array(
         [
@@ -48,6 +49,11 @@ def quaternion_from_rotation(rotation: Rotation) -> Float[ndarray, "4"]:
     x, y, z, w = np.linalg.eigh(k)[1][:, -1]
     wxyz = np.array([w, x, y, z])
     return wxyz if w >= 0 else -wxyz
+
+
+def xyzw_of(T: Pose) -> Float[ndarray, "4"]:
+    """The rotation of a pose as a unit quaternion in the order x, y, z, w."""
+    return np.roll(quaternion_from_rotation(T[:3, :3]), -1)
 
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Rotation:
@@ -65,8 +71,9 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Rotation:
 def rpy_from_rotation(rotation: Rotation) -> tuple[float, float, float]:
     """URDF's roll, pitch, yaw [rad] of a rotation matrix, with pitch in [-pi/2, pi/2]; roll is 0 in gimbal
     lock."""
-    pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
-    if np.hypot(rotation[0, 0], rotation[1, 0]) < 1e-9:
+    cosine = np.hypot(rotation[0, 0], rotation[1, 0])
+    pitch = np.arctan2(-rotation[2, 0], cosine)
+    if cosine < 1e-9:
         return 0.0, float(pitch), float(np.arctan2(-rotation[0, 1], rotation[1, 1]))
     roll = np.arctan2(rotation[2, 1], rotation[2, 2])
     return float(roll), float(pitch), float(np.arctan2(rotation[1, 0], rotation[0, 0]))
@@ -130,7 +137,7 @@ def pose(xyz: ArrayLike, *, wxyz: ArrayLike | None = None, rpy: ArrayLike | None
 
 def pose_entry(T: Pose) -> dict[str, list[float]]:
     """The pose as files hold it: `xyz` [m] and `wxyz`."""
-    return {"xyz": T[:3, 3].tolist(), "wxyz": quaternion_from_rotation(T[:3, :3]).tolist()}
+    return {"xyz": T[:3, 3].tolist(), "wxyz": quaternion_from_rotation(T).tolist()}
 
 
 def inverse(T: Pose) -> Pose:
@@ -143,6 +150,16 @@ def placed(T: Pose, points: Points) -> Points:
     return points @ T[:3, :3].T + T[:3, 3]
 
 
+def seen_from(T: Pose, points: Float[ndarray, "*n 3"]) -> Float[ndarray, "*n 3"]:
+    """Points p_a of frame a in a frame b: the inverse of `placed`, where T is the pose T_a_b."""
+    return (points - T[:3, 3]) @ T[:3, :3]
+
+
+def placed_each(T: Float[ndarray, "n 4 4"], points: Points) -> Float[ndarray, "n 3"]:
+    """`placed` for each point by its own pose."""
+    return np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
+
+
 def moved_spheres(T: Pose, spheres: Spheres) -> Spheres:
     """Spheres (x y z radius) of a frame b in frame a, where T is the pose T_a_b."""
     return np.column_stack([placed(T, spheres[:, :3]), spheres[:, 3]])
@@ -152,6 +169,12 @@ def ball_around(points: Points) -> tuple[Vector, float]:
     """Center and radius [m] of a ball around the points; its center is the center of their bounding box."""
     center = (points.min(axis=0) + points.max(axis=0)) / 2
     return center, float(np.linalg.norm(points - center, axis=1).max())
+
+
+def scaled_normals(triangles: Float[ndarray, "n 3 3"]) -> Points:
+    """For each triangle, a normal whose length is twice the triangle's area."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    return np.cross(b - a, c - a)
 
 
 def rotation_angle(rotation: Rotation) -> float:

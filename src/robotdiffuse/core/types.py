@@ -32,7 +32,7 @@ from robotdiffuse.core.errors import (
     rows,
     shown,
 )
-from robotdiffuse.core.files import check_output, known_ending, read_json, write_atomically
+from robotdiffuse.core.files import JsonObject, check_output, known_ending, read_json, write_atomically
 from robotdiffuse.core.settings import Bound, Natural, Number, converted
 
 Configuration = Float[ndarray, "dof"]
@@ -175,11 +175,7 @@ class Value:
         return [name for name in super().__dir__() if "." not in name]
 
     def __post_init__(self) -> None:
-        for name in (entry.name for entry in fields(self)):  # type: ignore[arg-type]
-            value = getattr(self, name)
-            frozen = read_only(value)
-            if frozen is not value:
-                object.__setattr__(self, name, frozen)
+        self.__setstate__({entry.name: getattr(self, entry.name) for entry in fields(self)})  # type: ignore
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         # arrays from a pickle or a deep copy are writable
@@ -213,7 +209,8 @@ class ReadOnlyDict(dict[Any, Any]):
     def _refuse(self, *_: Any, **__: Any) -> NoReturn:
         raise TypeError("this dictionary cannot be changed; change a copy: dict(...)")
 
-    __setitem__ = __delitem__ = __ior__ = update = setdefault = pop = popitem = clear = _refuse
+    if not TYPE_CHECKING:
+        __setitem__ = __delitem__ = __ior__ = update = setdefault = pop = popitem = clear = _refuse
 
     def __reduce__(self) -> tuple[Any, ...]:
         return read_only, (dict(self),)
@@ -255,7 +252,7 @@ class Path(Value):
     @property
     def length(self) -> float:
         """Sum of the Euclidean lengths of the segments in joint space [rad]."""
-        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+        return float(step_lengths(self.positions).sum())
 
 
 class Tree(NamedTuple):
@@ -327,14 +324,13 @@ class Trajectory(Value):
     def stops(self) -> Float[ndarray, "k"]:
         """Times [s] at which the whole arm rests between start and end. A wait is one stop, at its middle.
 
-        Only rows are checked, and the rows after `resample` may miss a stop: read `stops` before resampling.
+        Only rows are checked: of neighboring rows that are almost at rest, the slowest.
         """
         speed = np.linalg.norm(self.velocities, axis=1)
-        edges = np.diff((speed <= REST * speed.max()).astype(int), prepend=0, append=0)
-        first = np.flatnonzero(edges == 1)
-        last = np.flatnonzero(edges == -1) - 1
-        inside = (first > 0) & (last < len(speed) - 1)
-        return (self.times[first[inside]] + self.times[last[inside]]) / 2
+        resting = speed <= REST * speed.max()
+        runs = np.split(np.arange(len(speed)), np.flatnonzero(np.diff(resting)) + 1)
+        slowest = [run[speed[run] == speed[run].min()] for run in runs[1:-1] if resting[run[0]]]
+        return np.array([self.times[rows[[0, -1]]].mean() for rows in slowest])
 
     @property
     def peak_jerks(self) -> Float[ndarray, "dof"]:
@@ -394,11 +390,14 @@ class Trajectory(Value):
     def resample(self, rate: float | int) -> "Trajectory":
         """Sample the motion at a constant rate, with a last row at its end.
 
+        If the motion stops on its way, it is slowed down by less than a step before each stop, so that a row
+        is at the stop.
         At a low rate, the cubics between the new rows may need larger accelerations than this motion has,
         where its acceleration changes quickly. A motion from rest to rest is then averaged: its rows lie on
         the uniform cubic
         B-spline that has the resampled positions as control points. An averaged motion leaves the path by up
-        to a sixth of the acceleration divided by rate², and lasts up to three steps longer. Validate the
+        to a sixth of the acceleration divided by rate², and lasts up to three steps longer, and two for each
+        stop. Validate the
         returned motion: between its rows it may differ from this one.
 
         Args:
@@ -413,10 +412,20 @@ class Trajectory(Value):
         rate = converted("rate", SampleRate, rate)
         if len(self.times) == 1:
             return self
-        count = int(np.ceil((self.duration - TIME_TOLERANCE) * rate))
-        times = np.append(np.arange(max(count, 1)) / rate, self.duration)
-        state = self.at(times)
-        rows = Trajectory(self.joint_names, times, *state[:3])
+        cuts = np.array([0.0, *self.stops, self.duration])
+        lengths = np.diff(cuts)
+        steps = np.ceil(lengths[:-1] * rate - TIME_TOLERANCE)
+        begins = np.append(0.0, np.cumsum(steps)) / rate  # new times of the start and of the stops
+        duration = begins[-1] + lengths[-1]
+        count = int(np.ceil((duration - TIME_TOLERANCE) * rate))
+        times = np.append(np.arange(max(count, 1)) / rate, duration)
+        part = np.searchsorted(begins, times, side="right") - 1
+        speed = (lengths / np.diff(begins, append=duration))[part, None]
+        state = self.at(cuts[part] + speed[:, 0] * (times - begins[part]))
+        velocities = speed * state.velocities
+        rows = Trajectory(
+            self.joint_names, times, state.positions, velocities, speed**2 * state.accelerations
+        )
         ends = np.stack(rows.cubic_accelerations)
         max_acceleration = np.abs(self.cubic_accelerations).max(axis=(0, 1))
         off = np.abs(ends - (rows.accelerations[:-1], rows.accelerations[1:]))
@@ -425,7 +434,9 @@ class Trajectory(Value):
             as_strong and (off <= ACCELERATION_SHARE * max_acceleration).all()
         ):
             return rows
-        return Trajectory(self.joint_names, *spline_rows(state.positions, 1 / rate))
+        # a spline rests at a control point that is repeated
+        control_points = np.repeat(state.positions, 1 + 2 * np.isin(times, begins[1:]), axis=0)
+        return Trajectory(self.joint_names, *spline_rows(control_points, 1 / rate))
 
     def save(self, file: str | FilePath, rate: float | int | None = None) -> None:
         """Write the motion.
@@ -449,7 +460,7 @@ class Trajectory(Value):
         else:
             write_atomically(path, self._csv())
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> JsonObject:
         """Convert the trajectory to JSON values.
 
         Returns:
@@ -466,11 +477,11 @@ class Trajectory(Value):
         names = [f"'{name}" if name[0] in "=+-@" else name for name in self.joint_names]
         writer.writerow(["time", *(f"{name}_{kind}" for kind in kinds for name in names)])
         columns = (self.times[:, None], *(getattr(self, rows) for rows in ROWS))
-        writer.writerows([repr(value) for value in row] for row in np.concatenate(columns, axis=1).tolist())
+        writer.writerows(np.concatenate(columns, axis=1).tolist())
         return stream.getvalue()
 
 
-def _write_json(file: FilePath, record: dict[str, Any]) -> None:
+def _write_json(file: FilePath, record: JsonObject) -> None:
     try:
         text = json.dumps(record, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -488,6 +499,21 @@ def interpolated(
     """The rows at the times `at`, interpolated linearly between the rows at `times`; the first row before the
     first time, the last row after the last time."""
     return np.stack([np.interp(at, times, column) for column in rows.T], axis=-1)
+
+
+def step_lengths(rows: ArrayLike) -> Values:
+    """The Euclidean distance from each row to the next."""
+    return np.linalg.norm(np.diff(rows, axis=0), axis=1)
+
+
+def arc_lengths(rows: ArrayLike) -> Values:
+    """The sum of the `step_lengths` from the first row to each row."""
+    return np.append(0.0, np.cumsum(step_lengths(rows)))
+
+
+def nearest_first(rows: JointRows, to: Configuration) -> JointRows:
+    """The rows, sorted by their Euclidean distance from a configuration."""
+    return rows[np.argsort(np.linalg.norm(rows - to, axis=1), kind="stable")]
 
 
 def spline_rows(
@@ -514,14 +540,8 @@ def spline_rows(
             np.repeat(controls[-1:] - controls[0], window + 1, axis=0),
         ]
     )
-    total = np.cumsum(moved, axis=0)
-    points = (total[window:] - total[:-window]) / window
-    before = points[:-2]
-    at = points[1:-1]
-    after = points[2:]
-    q = controls[0] + (before + 4 * at + after) / 6
-    v = (after - before) / (2 * step)
-    a = (after - 2 * at + before) / step**2
+    q, v, a = spline_states(running_means(moved, window), step)
+    q += controls[0]
     q[-1] = controls[-1]
     v[0] = velocity
     v[-1] = 0.0
@@ -529,7 +549,27 @@ def spline_rows(
     return step * np.arange(len(q)), q, v, a
 
 
+def running_means(rows: ndarray, window: int) -> ndarray:
+    """The mean of every `window` successive rows, from the second row on."""
+    total = np.cumsum(rows, axis=0)
+    return (total[window:] - total[:-window]) / window
+
+
+def spline_states(points: JointRows, step: float) -> tuple[JointRows, ...]:
+    """Positions, velocities and accelerations of the uniform cubic B-spline with control points `step` [s]
+    apart, at all of them but the first and the last."""
+    before = points[:-2]
+    at = points[1:-1]
+    after = points[2:]
+    return (before + 4 * at + after) / 6, (after - before) / (2 * step), (after - 2 * at + before) / step**2
+
+
 RATES = ("velocities", "accelerations")
+
+
+def array_names(motion: Path | Trajectory) -> tuple[str, ...]:
+    """The names of a motion's arrays, the positions first."""
+    return ("positions", *(("times", *RATES) if isinstance(motion, Trajectory) else ()))
 
 
 def check_motion_arrays(
@@ -692,7 +732,7 @@ class PlanResult:
         """Number of times that the arm rests between start and goal; None without a trajectory."""
         return None if self.trajectory is None else len(self.trajectory.stops)
 
-    def save(self, file: str | FilePath, problem: dict[str, Any] | None = None) -> None:
+    def save(self, file: str | FilePath, problem: JsonObject | None = None) -> None:
         """Write the result.
 
         Args:
@@ -719,7 +759,7 @@ class PlanResult:
         else:
             self.trajectory.save(path)
 
-    def record(self, problem: dict[str, Any] | None = None) -> dict[str, Any]:
+    def record(self, problem: JsonObject | None = None) -> JsonObject:
         """Convert the result to JSON values.
 
         Args:
@@ -733,7 +773,7 @@ class PlanResult:
         """
         check_type("problem", problem, (dict, NoneType), "the content of a problem file, a table")
         path = self.path
-        record: dict[str, Any] = {"status": self.status.value}
+        record: JsonObject = {"status": self.status.value}
         record |= {name: getattr(self, name) for name in RECORDED}
         record |= {
             "verified": self.solved,
@@ -755,7 +795,7 @@ class ResultFile:
     """Content of a result file."""
 
     result: PlanResult
-    problem: dict[str, Any] | None
+    problem: JsonObject | None
     """The problem as in a problem file, if it was saved too."""
 
 
@@ -823,7 +863,7 @@ RECORDED: dict[str, Any] = {
 lacks is null."""
 
 
-def _result(record: dict[str, Any]) -> PlanResult:
+def _result(record: JsonObject) -> PlanResult:
     statuses = {status.value: status for status in Status}
     check_name("status", record["status"], statuses)
     status = statuses[record["status"]]
@@ -842,7 +882,7 @@ def _result(record: dict[str, Any]) -> PlanResult:
     return PlanResult(status=status, **values)
 
 
-def _trajectory(record: dict[str, Any]) -> Trajectory:
+def _trajectory(record: JsonObject) -> Trajectory:
     rows_of = {name: record.get(name) for name in ("positions", "times", *RATES)}
     names, arrays = check_motion_arrays(record["joint_names"], rows_of)
     if arrays["times"][0] != 0:

@@ -9,7 +9,7 @@ target's position is our interpretation. Both arrays are float32.
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path as FilePath
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
@@ -22,8 +22,8 @@ from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError, check_type, counted, joined, numbers, reading, shown
 from robotdiffuse.core.files import check_output, file_name, input_file, lock_folder, write_atomically
-from robotdiffuse.core.settings import Bound, converted
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.core.settings import AtLeastTwo, converted
+from robotdiffuse.core.types import Path, Trajectory, step_lengths
 from robotdiffuse.datasets.shards import (
     MANIFEST,
     SPLITS,
@@ -102,7 +102,7 @@ def write_dataset(
         3
     """
     arm = robot if isinstance(robot, Robot) else load_robot(robot)
-    waypoints = converted("waypoints", Annotated[int, Bound(least=2.0)], waypoints)
+    waypoints = converted("waypoints", AtLeastTwo, waypoints)
     target = file_name(folder, "folder")
     source = arm.source or arm.name
     if robot_fingerprint(load_robot(source)) != robot_fingerprint(arm):
@@ -190,7 +190,7 @@ def measured_row(
     ends = q[[0, -1]]
     checker = CollisionChecker(robot, scene)
     line = motions_free(search_space(checker, RESOLUTION), ends)
-    cost = float(np.linalg.norm(np.diff(q.astype(np.float64), axis=0), axis=1).sum())
+    cost = float(step_lengths(q.astype(np.float64)).sum())
     return row_of(
         packed,
         q,
@@ -258,8 +258,8 @@ def export_npz(folder: str | FilePath, file: str | FilePath) -> tuple[int, int]:
             f"{folder} has {manifest.waypoints} waypoints of {manifest.dof} joints; "
             f"robot.npz holds {WAYPOINTS} waypoints of {DOF} joints"
         )
-    x = [np.zeros((0, WAYPOINTS, DOF), np.float32)]
-    y = [np.zeros((0, CONDITION_NUMBERS), np.float32)]
+    x = []
+    y = []
     total = 0
     for index in shard_indices(folder):
         shard = read_shard(folder, index)
@@ -267,15 +267,15 @@ def export_npz(folder: str | FilePath, file: str | FilePath) -> tuple[int, int]:
         total += len(shard["trajectories"])
         kinds = shard["obstacle_kinds"]
         rows = np.flatnonzero(((kinds == SPHERE).sum(1) == 2) & ((kinds != NONE).sum(1) == 2))
-        q = shard["trajectories"][rows]
+        q = np.asarray(shard["trajectories"][rows])
         kinds = kinds[rows]
         centers = shard["obstacle_params"][rows][kinds == SPHERE, :3].reshape(-1, 6)
         x.append(q)
         y.append(np.concatenate([shard["start"][rows], q[:, -1], centers, shard["target_pose"][rows, 4:]], 1))
+    if not any(map(len, x)):
+        raise InputError(f"{folder} has no scene of exactly two spheres, all that robot.npz can hold")
     x_train = np.concatenate(x)
     y_train = np.concatenate(y)
-    if not len(x_train):
-        raise InputError(f"{folder} has no scene of exactly two spheres, all that robot.npz can hold")
     write_atomically(file, lambda stream: np.savez(stream, x_train=x_train, y_train=y_train))
     return len(x_train), total - len(x_train)
 

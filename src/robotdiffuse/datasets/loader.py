@@ -3,7 +3,6 @@
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +12,8 @@ from jaxtyping import Float32, Int8
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, check_name, check_type, described, needs, shown
-from robotdiffuse.core.settings import Bound, Count, converted
+from robotdiffuse.core.settings import AtLeastTwo, Bound, Count, converted
+from robotdiffuse.core.types import frozen_dataclass
 from robotdiffuse.datasets.shards import SPLITS, read_manifest, read_rows
 from robotdiffuse.robots.kinematic_tree import JointNormalizer
 from robotdiffuse.robots.robot import Robot
@@ -35,7 +35,7 @@ MAX_THREADS = 8
 """Largest number of threads that prefetch batches."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class RopBatch:
     """A batch of the data set, on its device."""
 
@@ -96,7 +96,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         points = converted("points", Count, points)
         seed = converted("seed", Seed, seed)
         if waypoints is not None:
-            waypoints = converted("waypoints", Annotated[int, Bound(least=2.0)], waypoints)
+            waypoints = converted("waypoints", AtLeastTwo, waypoints)
         if robot is not None:
             check_type("robot", robot, Robot, "an rd.Robot")
         self.manifest = read_manifest(folder)
@@ -157,8 +157,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
             seed = self.seed if worker is None else worker.seed % 2**63
             self._generators[number] = torch.Generator(self.device).manual_seed(seed)
         batch = self._batch(np.array(indices), self._generators[number])
-        columns = {field.name: getattr(batch, field.name) for field in fields(batch)}
-        return [{name: column[i] for name, column in columns.items()} for i in range(len(indices))]
+        return [{name: column[i] for name, column in vars(batch).items()} for i in range(len(indices))]
 
     def batches(
         self, batch_size: int, shuffle: bool = True, generator: torch.Generator | None = None

@@ -43,8 +43,18 @@ from robotdiffuse.core.files import (
 from robotdiffuse.core.interrupts import delay_interrupts
 from robotdiffuse.core.settings import Count, Natural, Settings
 from robotdiffuse.core.transforms import quaternion_from_rotation
-from robotdiffuse.core.types import Configurations, Mask, Path, Pose, Trajectory, Values
+from robotdiffuse.core.types import (
+    Configurations,
+    Mask,
+    Path,
+    Pose,
+    Trajectory,
+    Values,
+    frozen_dataclass,
+    interpolated,
+)
 from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot, robot_fingerprint
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes, floor_row
@@ -129,14 +139,17 @@ class Manifest(Settings):
         floor = self.floors[list(self.families)[family]]
         return None if floor is None else Box(**floor, name="floor")
 
-    def check_robot(self, robot: Robot) -> None:
-        """Raise InputError if the data were made with another robot."""
+    def check_robot(self, robot: Robot | None) -> Robot:
+        """The robot of the data: the given one, or for None the one with the name in the manifest. Raises
+        InputError if the data were made with another robot."""
+        robot = load_robot(self.robot) if robot is None else robot
         fingerprint = robot_fingerprint(robot)
         if fingerprint != self.robot_fingerprint:
             raise InputError(
                 f"the data are of the robot {self.robot} with fingerprint {self.robot_fingerprint}; "
                 f"{robot.name} has {fingerprint}; use the robot of the data"
             )
+        return robot
 
 
 def write_manifest(folder: str | FilePath, manifest: Manifest) -> None:
@@ -214,18 +227,20 @@ Joint values are in [rad] or, for prismatic joints, [m]; times in [s], lengths i
 UNBOUNDED = {"goals", "goal_costs"}
 """Arrays that may hold NaN or inf."""
 
+Arrays = dict[str, ndarray]
+Counts = dict[str, int]
 _SHARD_NAME = re.compile(r"shard_(\d{5,})\.zarr")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Shard:
     """One shard, with all arrays or some of them."""
 
     index: int
     fingerprint: str
-    counts: dict[str, int]
+    counts: Counts
     """Numbers of problems by outcome: tried, solved, unsolved, thinned, refused, ..."""
-    arrays: dict[str, ndarray]
+    arrays: Arrays
     """Arrays by their names in ARRAYS."""
 
     def __getitem__(self, name: str) -> ndarray:
@@ -269,9 +284,7 @@ def _zarr() -> ModuleType:
 
 # Ctrl-C within a call of zarr leaves coroutines behind, which warn at the exit
 @delay_interrupts()
-def write_shard(
-    folder: str | FilePath, index: int, arrays: dict[str, ndarray], counts: dict[str, int]
-) -> None:
+def write_shard(folder: str | FilePath, index: int, arrays: Arrays, counts: Counts) -> None:
     """Write a shard atomically; an existing shard of this index is replaced.
 
     arrays: all arrays of ARRAYS, without `times` if the timing is "arc". Raises InputError if the arrays do
@@ -312,7 +325,7 @@ def write_shard(
             file.write_bytes(content.to_bytes())
 
 
-def _fingerprint(arrays: dict[str, ndarray]) -> str:
+def _fingerprint(arrays: Arrays) -> str:
     """A hash of the hashes of the arrays, in the order of their names."""
     fingerprints = []
     for name, array in sorted(arrays.items()):
@@ -466,7 +479,7 @@ def row_of(
     """
     padding = [(0, most_goals - len(goals)), (0, 0)]
     straight = float(np.linalg.norm(q[-1].astype(np.float64) - q[0]))
-    wxyz = quaternion_from_rotation(T_base_tip[:3, :3])
+    wxyz = quaternion_from_rotation(T_base_tip)
     row: JsonObject = values | {
         "trajectories": q,
         "start": q[0],
@@ -532,7 +545,7 @@ ARRAYS_READ = ("trajectories", "target_pose", "obstacle_kinds", "obstacle_params
 """Names of the arrays that `read_rows` reads if it does not check whole shards."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Rows:
     """The rows of a shard, or copies turned about the vertical."""
 
@@ -592,9 +605,7 @@ def resample(q: Float[ndarray, "n stored dof"], waypoints: int) -> Float[ndarray
     steps = np.linalg.norm(np.diff(q, axis=1, prepend=q[:, :1]), axis=2)
     resampled = np.empty((len(q), waypoints, q.shape[2]), q.dtype)
     for motion, lengths, out in zip(q, np.cumsum(steps, axis=1, dtype=np.float64), resampled, strict=True):
-        at = np.linspace(0.0, lengths[-1], waypoints)
-        for joint in range(q.shape[2]):
-            out[:, joint] = np.interp(at, lengths, motion[:, joint])
+        out[:] = interpolated(np.linspace(0.0, lengths[-1], waypoints), lengths, motion)
     resampled[:, 0] = q[:, 0]
     resampled[:, -1] = q[:, -1]
     return resampled

@@ -6,7 +6,6 @@ configurations (vias), the nearest motions of the data, and smooth noise, each w
 """
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +24,7 @@ from robotdiffuse.core.errors import InputError, check_name, counted
 from robotdiffuse.core.files import check_not_input, lock_folder
 from robotdiffuse.core.settings import Count, OneOf, Settings
 from robotdiffuse.core.tables import Column, Figure, Table
-from robotdiffuse.core.types import Values
+from robotdiffuse.core.types import Values, frozen_dataclass
 from robotdiffuse.datasets.shards import read_manifest
 from robotdiffuse.evaluation.bench_comparisons import Mean, bootstrap_interval, wilson_interval
 from robotdiffuse.evaluation.metrics import link_length
@@ -47,7 +46,7 @@ from robotdiffuse.learning.training.tasks import train_encoder, train_planner
 from robotdiffuse.planning.diffusion import Diffusion
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.rop import ROP, Rop
-from robotdiffuse.problems.files import Case
+from robotdiffuse.problems.files import Case, Progress
 from robotdiffuse.processes.workers import Workers
 from robotdiffuse.robots import load_robot
 
@@ -66,7 +65,7 @@ class Row(NamedTuple):
     report."""
 
 
-ROWS: dict[str, Row] = {
+ROWS = {
     "PointNet": Row("table2_pointnet", True, (69.4, 26.7, 17.154, 42)),
     "DGCNN": Row("table2_dgcnn", True, (73.4, 22.5, 16.864, 64)),
     "U-Net": Row("table2_unet", True, (59.3, 29.7, 17.358, 27)),
@@ -119,7 +118,7 @@ class AblationSettings(Settings):
     """Number of training runs of each row, with seeds 0, 1, ...; figures are means over these runs."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Evaluation:
     """Figures of a network or control, one value for each problem."""
 
@@ -166,7 +165,7 @@ def run_ablation(
     settings: AblationSettings,
     rows: list[str],
     workers: int,
-    report: Callable[[str], None],
+    report: Progress,
 ) -> list[RowResult]:
     """Train the networks of the rows and evaluate every row. After an interruption, the same call continues
     the work.

@@ -21,7 +21,7 @@ from typing import Annotated, Any
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, check_name
-from robotdiffuse.core.files import JsonLines, is_file, lock_folder, writing
+from robotdiffuse.core.files import JsonLines, append_line, is_file, lock_folder, writing
 from robotdiffuse.core.settings import Count, Filled, OneOf, Positive, Settings
 from robotdiffuse.evaluation.metrics import measured
 from robotdiffuse.evaluation.report import processor, versions
@@ -182,7 +182,7 @@ class PlannerProcess:
 
     def close(self) -> None:
         """Kill the process, even if another thread waits for it."""
-        self._worker.close(0.0)
+        self._worker.close()
 
     def _ask(self, timeout: float, call: Callable[..., Fields | None], *arguments: Any) -> Fields | None:
         """The answer of a call in the process; if the process gave no answer, the fields of a record with the
@@ -229,7 +229,7 @@ def _warm_up(record: Fields) -> None:
     _warm.add(problem.robot)
     try:
         for result in _planner.warm_up(problem):
-            if result.path is not None and result.trajectory is not None:
+            if result.trajectory is not None:
                 measured(problem.robot, result.path, result.trajectory, result)
     except (Exception, SystemExit):  # the timed call will meet this error too, and report it
         traceback.print_exc()
@@ -265,8 +265,7 @@ def on_this_machine(settings: "BenchSettings", runs: Sequence[Run], session: str
     specs = settings.specs
     workers = settings.workers
     planners = {
-        label: PlannerProcess(specs[label], _log_file(settings.logs, label), settings.cpu_time)
-        for label in first
+        label: PlannerProcess(specs[label], settings.log_file(label), settings.cpu_time) for label in first
     }
     pool = ThreadPoolExecutor(workers)
     todo = list(runs)
@@ -304,9 +303,7 @@ def on_cluster(settings: "BenchSettings", runs: Sequence[Run], session: str) -> 
     for number, (answers, output) in CLUSTERS[settings.cluster](_run_task, tasks):
         _, part, _ = tasks[number]
         if output:
-            settings.logs.mkdir(parents=True, exist_ok=True)
-            with _log_file(settings.logs, part[0].method).open("a") as log:
-                log.write(output)
+            append_line(settings.log_file(part[0].method), output.rstrip(), make_folder=True)
         for run, answer in zip(part, answers, strict=True):
             yield run, records_of(run, answer, {"run": session, "workers": settings.cluster})
 
@@ -316,10 +313,6 @@ def records_of(run: Run, answers: Sequence[Fields], about: Fields) -> list[Recor
     labels = (run.method, run.method + RESTARTED)
     pairs = zip(labels, answers, strict=False)
     return [run.record({"planner": label, **about, **answer}) for label, answer in pairs]
-
-
-def _log_file(logs: Path, label: str) -> Path:
-    return logs / f"{label.replace('/', '_')}.log"
 
 
 def _run_task(spec: PlannerSpec, runs: list[Run], restarts: bool) -> tuple[list[list[Fields]], str]:
@@ -377,10 +370,9 @@ class BenchSettings(Settings):
                 f"cpu_time is True and cluster is {self.cluster}; CPU time is measured only on this machine"
             )
 
-    @property
-    def logs(self) -> Path:
-        """Folder of the files with the planners' output."""
-        return self.out / "logs"
+    def log_file(self, label: str) -> Path:
+        """File with the output of the planner with this name in results."""
+        return self.out / "logs" / f"{label.replace('/', '_')}.log"
 
     @cached_property
     def specs(self) -> dict[str, PlannerSpec]:
@@ -439,9 +431,7 @@ def open_runs(
             if is_answered:
                 answered.add((label, *record.case))
     runs = runs_of(cases, settings.specs, range(settings.seeds), settings.time_limit)
-    return [
-        run for run in runs if (run.method, run.case.problem_set, run.case.name, run.seed) not in answered
-    ]
+    return [run for run in runs if (run.method, *run.case.key, run.seed) not in answered]
 
 
 def _check_weights(settings: BenchSettings, sessions: Sequence[Mapping[str, Any]]) -> None:
@@ -495,7 +485,6 @@ class Preset:
     """A named comparison: planners that run on the first `count` problems of each set, with each of the time
     limits."""
 
-    description: str
     planners: tuple[str, ...]
     problems: tuple[str, ...]
     limits: tuple[float, ...]
@@ -506,9 +495,9 @@ class Preset:
     """See `BenchSettings`."""
 
 
-PRESETS: dict[str, Preset] = {
+PRESETS = {
+    # path lengths at one second: search, diffusion, learned baselines
     "equal_time": Preset(
-        "path lengths at one second: search, diffusion, learned baselines",
         (
             *(AORRTC, RRT_CONNECT, "shared_tree_rrt_star"),
             *("diffusion", "mpd", "edmp", "mpnet", "mpinets"),
@@ -517,15 +506,15 @@ PRESETS: dict[str, Preset] = {
         (1.0,),
         30,
     ),
+    # the diffusion network against search, with 0.1 and 0.3 s
     "learning": Preset(
-        "the diffusion network against search, with 0.1 and 0.3 s",
         ("diffusion", AORRTC, "shared_tree_rrt_star"),
         (*ROP, "shelf_nontrivial"),
         (0.1, 0.3),
         150,
     ),
+    # durations of motions with 0.1 and 1 s: minimizing time, minimizing length, and OMPL's timed paths
     "durations": Preset(
-        "durations of motions with 0.1 and 1 s: minimizing time, minimizing length, and OMPL's timed paths",
         (
             "aorrtc",
             "diffusion",
@@ -538,15 +527,15 @@ PRESETS: dict[str, Preset] = {
         100,
         equal_time=False,
     ),
+    # Shared-Tree Informed RRT* and AORRTC against OMPL's AORRTC and Informed RRT*
     "anytime": Preset(
-        "Shared-Tree Informed RRT* and AORRTC against OMPL's AORRTC and Informed RRT*",
         ("shared_tree_rrt_star", AORRTC, "ompl_aorrtc", "ompl_informed_rrt_star"),
         ROP,
         (1.0,),
         100,
     ),
+    # AORRTC against restarts of RRT-Connect until the same limit
     "restarts": Preset(
-        "AORRTC against restarts of RRT-Connect until the same limit",
         (AORRTC, RRT_CONNECT),
         (*ROP, "shelf_nontrivial"),
         (1.0,),

@@ -11,7 +11,7 @@ paper's ComScore.
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.files import JsonLines
 from robotdiffuse.core.tables import Figure
-from robotdiffuse.core.types import Status, Values
+from robotdiffuse.core.types import Status, Values, frozen_dataclass
 from robotdiffuse.evaluation.metrics import METRICS, Metric
 from robotdiffuse.evaluation.report import share_cell
 from robotdiffuse.evaluation.runs import (
@@ -129,8 +129,7 @@ def compare(a: Values, b: Values) -> Paired:
 # The paper's ComScore
 
 
-@dataclass(frozen=True)
-class Indicators:
+class Indicators(NamedTuple):
     """The four figures of a planner from which ComScore is computed; NaN if unknown."""
 
     success: float
@@ -154,7 +153,7 @@ def normalized(rows: Sequence[Indicators]) -> Float[ndarray, "n 4"]:
     as good as the best. An unknown indicator (NaN, such as the length if no problem was solved) gets 0, like
     the worst row.
     """
-    values = np.array([astuple(row) for row in rows], dtype=np.float64).reshape(len(rows), 4)
+    values = np.array(rows, dtype=np.float64).reshape(len(rows), 4)
     if not len(rows):
         return values
     gains = np.where(HIGHER_IS_BETTER, values, -values)
@@ -211,7 +210,7 @@ Calls = dict[Key, list[Record]]
 # The folder
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Bench:
     """The content of a folder of `bench run`."""
 
@@ -461,7 +460,7 @@ class Comparison:
         return [m for m in METRICS.values() if any(row.mean(m) is not None for row in self.rows)]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Curve:
     """Success and path lengths of a planner over time, from its calls with the longest limit."""
 

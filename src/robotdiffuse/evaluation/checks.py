@@ -22,7 +22,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Natural, converted
 from robotdiffuse.core.tables import Column, Table
-from robotdiffuse.core.types import Path
+from robotdiffuse.core.types import Path, frozen_dataclass
 from robotdiffuse.datasets.shards import (
     Manifest,
     Shard,
@@ -37,7 +37,6 @@ from robotdiffuse.datasets.shards import (
 )
 from robotdiffuse.evaluation.runs import Record, read_cases, read_records
 from robotdiffuse.processes.workers import Workers, in_order
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import Verifier
@@ -45,7 +44,7 @@ from robotdiffuse.validation.validator import Verifier
 if TYPE_CHECKING:
     from robotdiffuse.simulation.validator import OracleContact
 
-KINDS: dict[str, str] = {
+KINDS = {
     "damaged": "shards damaged",
     "ends": "start or goal not exact",
     "limits": "joint limits exceeded",
@@ -181,8 +180,7 @@ def check_data(
     began = time.perf_counter()
     count = converted("count", Natural | None, count)
     manifest = read_manifest(folder)
-    robot = load_robot(manifest.robot) if robot is None else robot
-    manifest.check_robot(robot)
+    robot = manifest.check_robot(robot)
     if pybullet:
         import robotdiffuse.simulation  # noqa: F401  (fails at once if PyBullet is not installed)
     indices = existing_shards(folder)
@@ -222,7 +220,7 @@ def check_data(
     )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class _Task:
     """The work of a process. Objects are pickled to be sent to processes."""
 

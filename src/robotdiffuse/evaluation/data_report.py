@@ -1,7 +1,7 @@
 """The report of a data set: its statistics as tables and plots."""
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.files import check_output, write_atomically
 from robotdiffuse.core.tables import NO_VALUE, Column, Table, plain
-from robotdiffuse.core.types import Mask
+from robotdiffuse.core.types import Mask, frozen_dataclass
 from robotdiffuse.datasets.shards import (
     SPLITS,
     Manifest,
@@ -23,7 +23,6 @@ from robotdiffuse.datasets.shards import (
     split_of,
 )
 from robotdiffuse.evaluation.report import Histograms, Report, histograms
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 
 QUANTITIES = {
@@ -67,7 +66,7 @@ SAFETY_TOLERANCE = 0.002
 between waypoints cut corners."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class DataFigures:
     """Arrays of a data set, in the order of its shards, and statistics computed from them."""
 
@@ -220,7 +219,6 @@ def write_page(folder: str | Path, file: str | Path, robot: Robot | None = None)
     read_manifest(folder)  # first, since without a data set the page's folder is often missing too
     target = check_output(file, (".html", ".htm"))
     data = read_figures(folder)
-    robot = load_robot(data.manifest.robot) if robot is None else robot
     data.manifest.check_robot(robot)
     write_atomically(target, data_report(data, Path(folder).resolve().name).page)
     return data

@@ -18,6 +18,8 @@ from robotdiffuse.core.types import (
     State,
     Trajectory,
     Values,
+    frozen_dataclass,
+    step_lengths,
 )
 from robotdiffuse.datasets.shards import resample
 from robotdiffuse.robots.robot import Robot
@@ -60,7 +62,7 @@ def link_length(robot: Robot, q: Float[ndarray, "n waypoints dof"]) -> Values:
     return np.linalg.norm(np.diff(at, axis=1), axis=-1).sum(axis=(1, 2))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Motion:
     """A motion to be measured. Values that several metrics need are computed once."""
 
@@ -166,9 +168,10 @@ _METRICS = (
     Metric("turning", "rad", "less", ".2f", lambda m: turning(m.path.positions)),
     Metric("bending", "", "less", ".0f", lambda m: bending(m.path.positions)),
     # min_clearance is the smaller of scene_clearance (to obstacles) and self_clearance (of the arm to itself)
-    Metric("min_clearance", "mm", "more", ".1f", _clearance("min_clearance"), 1000.0),
-    Metric("scene_clearance", "mm", "more", ".1f", _clearance("scene_clearance"), 1000.0),
-    Metric("self_clearance", "mm", "more", ".1f", _clearance("self_clearance"), 1000.0),
+    *(
+        Metric(name, "mm", "more", ".1f", _clearance(name), 1000.0)
+        for name in ("min_clearance", "scene_clearance", "self_clearance")
+    ),
     Metric("duration", "s", "less", ".2f", _timed(lambda t, _: t.duration)),
     Metric("over_straight_line", "", "less", ".3f", _timed(_over_straight_line)),
     Metric("stops", "", "less", ".2f", _timed(lambda t, _: float(len(t.stops)))),
@@ -210,7 +213,7 @@ def turning(positions: Configurations) -> float:
     steps = steps[np.linalg.norm(steps, axis=1) > STANDSTILL]
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)
     # unlike the arc cosine of the unit vectors' dot product, this is accurate for small angles
-    half = np.linalg.norm(np.diff(steps, axis=0), axis=1) / 2
+    half = step_lengths(steps) / 2
     return float(2 * np.arcsin(np.minimum(half, 1.0)).sum())
 
 

@@ -9,7 +9,7 @@ ten configurations. A motion succeeds if it ends within 1 cm and 15 degrees of t
 import itertools
 import timeit
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -171,9 +171,9 @@ PAPER_PARTS = "compression_autoencoder", "transformer", 254
 """Encoder, denoiser and number of waypoints of the paper's method."""
 PAPER_SAMPLES = 1_600_000
 """Number of samples of the paper's training: 25,000 batches of 64."""
-GUIDED_SAMPLE = ("samples=1", "repeat=false")
+GUIDED_SAMPLE = ":samples=1:repeat=false"
 """Planner settings for a single sample, without further samples if the validator refuses it."""
-UNGUIDED_SAMPLE = ("samples=1", "guidance_steps=0", "repeat=false")
+UNGUIDED_SAMPLE = ":samples=1:guidance_steps=0:repeat=false"
 """Planner settings for a single sample without collision guidance, as in the row JPC of the paper's Table 2
 (losses of joints, points and collision)."""
 NO_WEIGHTS = (
@@ -185,8 +185,7 @@ PAPER_METHOD = "RobotDiffuse"
 """Name of the row of the paper's own method in its Table 1."""
 
 
-@dataclass(frozen=True)
-class PaperRow:
+class PaperRow(NamedTuple):
     """A row of the paper's Table 1, as printed."""
 
     name: str
@@ -246,11 +245,11 @@ ROWS = (
     Row("MPiNets", "mpinets", "MPiNets"),
     Row("MPD", "mpd", "MPD"),
     Row("diffusion, as it ships: clearances as inputs", "diffusion", PAPER_METHOD),
-    Row("diffusion, a single sample", "diffusion:samples=1:repeat=false"),
-    Row("diffusion, a single sample, no guidance", ":".join(["diffusion", *UNGUIDED_SAMPLE])),
+    Row("diffusion, a single sample", f"diffusion{GUIDED_SAMPLE}"),
+    Row("diffusion, a single sample, no guidance", f"diffusion{UNGUIDED_SAMPLE}"),
     Row(
         "diffusion, a single sample, no guidance, no clearances: 32 points of the scene",
-        ":".join([f"diffusion@{POINTS}", *UNGUIDED_SAMPLE]),
+        f"diffusion@{POINTS}{UNGUIDED_SAMPLE}",
     ),
     Row("robotdiffuse, the default: aorrtc", "robotdiffuse"),
     Row("no planner: line to the nearest goal", "straight_line:goals=nearest"),
@@ -302,8 +301,8 @@ class Table1Settings:
             return ROWS + controls
         title = _title(self.paper_weights)
         diffusion = f"diffusion@{self.paper_weights}"
-        guided = Row(title, ":".join([diffusion, *GUIDED_SAMPLE]))
-        unguided = Row(f"{title}, no guidance", ":".join([diffusion, *UNGUIDED_SAMPLE]))
+        guided = Row(title, diffusion + GUIDED_SAMPLE)
+        unguided = Row(f"{title}, no guidance", diffusion + UNGUIDED_SAMPLE)
         return (*ROWS[:5], guided, unguided, *ROWS[5:], *controls)
 
     def command(self, name: str) -> str:
@@ -433,9 +432,9 @@ def _table(section: Section, rows: dict[str, Row]) -> Table:
     for planner_row in comparison.rows:
         # the mean time of all calls, solved or not, each until its planner returned
         time = Mean.of(o.record.time for o in planner_row.outcomes).value
-        indicators[rows[planner_row.planner].name] = replace(planner_row.figures, time=time)
+        indicators[rows[planner_row.planner].name] = planner_row.figures._replace(time=time)
     comscore = scores(tuple(rows.values()), indicators)
-    printed = {row.name: (*astuple(row.indicators), row.comscore) for row in PAPER_TABLE_1}
+    printed = {row.name: (*row.indicators, row.comscore) for row in PAPER_TABLE_1}
     printed_beside = section.problem_set == POSE
     table = []
     for planner_row in comparison.rows:

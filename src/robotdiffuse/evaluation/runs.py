@@ -41,6 +41,7 @@ from robotdiffuse.core.types import (
     PlanResult,
     Status,
     Values,
+    frozen_dataclass,
 )
 from robotdiffuse.evaluation.metrics import measured
 from robotdiffuse.learning.guidance import Trajectories
@@ -391,7 +392,7 @@ def read_records(folder: FilePath, methods: Sequence[str] | None = None) -> dict
     return {name: RecordFile(files[name]).records for name in methods or files}
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Run:
     """One call that a benchmark makes: a method on a problem, with a seed and a time limit."""
 
@@ -411,7 +412,7 @@ class Run:
     @property
     def key(self) -> tuple[str, str, int, float]:
         """The key of the run's record."""
-        return self.case.problem_set, self.case.name, self.seed, self.limit
+        return *self.case.key, self.seed, self.limit
 
     def rng(self) -> np.random.Generator:
         """A random number generator that gives the same numbers for all methods."""
@@ -633,7 +634,7 @@ def fields_of(result: PlanResult, robot: Robot) -> Fields:
         "stage": result.stage,
         "progress": [[round(at, 6), round(length, 6)] for at, length in result.progress],
     }
-    if result.path is not None and result.trajectory is not None:
+    if result.trajectory is not None:
         record |= measured(robot, result.path, result.trajectory, result)
         record["positions"] = np.round(result.path.positions, 9).tolist()
     return record

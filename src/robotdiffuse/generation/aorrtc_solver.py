@@ -6,13 +6,12 @@ is closer to them. The safety distance is lowered in steps if no path is found.
 """
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings
+from robotdiffuse.core.settings import Count, Natural, NotNegative, Positive, Settings, ShareBelowOne
 from robotdiffuse.core.types import Configuration, Configurations, Values
 from robotdiffuse.planning.search.rrt import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import StartGoal, falling_clearances
@@ -33,7 +32,7 @@ class AORRTCSearchSettings(Settings, name="aorrtc"):
     """Longest extension of a tree [rad, joint-space L2]."""
     resolution: Positive = 0.02
     """No point of the arm moves further than this between two checks of a motion [m]."""
-    gain: Annotated[float, Bound(least=0.0, below=1.0)] = 0.01
+    gain: ShareBelowOne = 0.01
     """The search ends when the last doubling of the iterations shortened the path by less than this
     fraction."""
     patience: Natural = 4_000

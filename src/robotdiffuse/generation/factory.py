@@ -24,10 +24,21 @@ from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError, check_name, needs
 from robotdiffuse.core.files import lock_folder
 from robotdiffuse.core.registry import Entry, Registry
-from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Settings, SettingsOf, Share
+from robotdiffuse.core.settings import (
+    AtLeastTwo,
+    Bound,
+    Count,
+    Natural,
+    OneOf,
+    Settings,
+    SettingsOf,
+    Share,
+)
 from robotdiffuse.core.types import Configurations, Path, interpolated
 from robotdiffuse.datasets.shards import (
     MANIFEST,
+    Arrays,
+    Counts,
     Manifest,
     Row,
     read_manifest,
@@ -93,7 +104,7 @@ class GenerationSettings(Settings):
     the pose. Arms with fewer than six joints always reach the position only."""
     goals: Annotated[int, Bound(least=1.0, most=127.0)] = 10
     """Largest number of goal configurations of a target, found by inverse kinematics (the paper's k)."""
-    waypoints: Annotated[int, Bound(least=2.0)] = 254
+    waypoints: AtLeastTwo = 254
     """Number of waypoints of a trajectory (the authors' number)."""
     timing: Annotated[str, OneOf(TIMINGS)] = "arc"
     """Spacing of waypoints: evenly in joint-space length (arc), or in time by time parameterization
@@ -146,9 +157,6 @@ EXTRA_PROBLEMS = 1_000
 """A shard with n rows fails after MAX_PROBLEMS_PER_ROW n + EXTRA_PROBLEMS problems."""
 PROBLEMS_PER_SHARD = 2**32
 """Problem numbers reserved for each shard, so that no two shards contain the same problem."""
-
-Arrays = dict[str, ndarray]
-Counts = dict[str, int]
 
 
 def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts]:

@@ -35,12 +35,14 @@ from robotdiffuse.interop.ros2 import (
     opened_recording,
     to_plain,
 )
-from robotdiffuse.perception.depth_view import INTEGER_NO_RETURN, DepthView
+from robotdiffuse.perception.depth_view import INTEGER_NO_RETURN, DepthView, Intrinsics
 from robotdiffuse.robots.robot import Robot, check_robot
 
 IMAGE = "sensor_msgs/msg/Image"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
+MEASURED = "/joint_states"
+"""If several topics hold the arm's joint states, only those of this topic are read."""
 ENCODINGS = {"32FC1": ("f4", 1.0), "16UC1": ("u2", 0.001), "mono16": ("u2", 0.001)}
 """For each encoding of depth images, the type of the pixels and the meters per unit (REP 118)."""
 MAX_SIZE = 64 * 10**9
@@ -179,7 +181,7 @@ def _read(
 ) -> Iterator[StampedView]:
     kinds = recording.kinds
     images = _image_topics(kinds, topics)
-    states = _States(robot)
+    states_of: dict[str, _States] = {}
     transforms = TransformHistory()
     infos: dict[str, JsonObject] = {}
     units: dict[str, float] = {}
@@ -192,17 +194,31 @@ def _read(
         if kind == CAMERA_INFO:  # fields are upper-case in ROS 1: K, D, P
             infos.setdefault(_folder(topic), {k.lower(): value for k, value in to_plain(message).items()})
         elif kind == JOINT_STATE:
-            states.add(_seconds(message, at), to_plain(message))
+            states_of.setdefault(topic, _States(robot)).add(_seconds(message, at), to_plain(message))
         elif kind == TRANSFORMS:
             for stamped in message.transforms:
                 transforms.add(to_plain(stamped), topic.endswith("static"), at)
         else:
             units[topic.partition("/option/")[0]] = float(message.data)
+    # several topics may hold the arm's joints, such as the measured and the commanded ones
+    of_arm = {topic: states for topic, states in states_of.items() if states.known}
+    if len(of_arm) > 1 and MEASURED not in of_arm:
+        raise InputError(
+            f"several topics hold joint states of {robot.name}: {', '.join(of_arm)}; the measured "
+            f"ones must be on {MEASURED}"
+        )
+    states = of_arm.get(MEASURED) or next(iter(of_arm.values()), _States(robot))
     has_views = False
+    first = ""
     reason: InputError | None = None
     for topic, at, message in recording.messages(images):
         if message.encoding not in ENCODINGS and topics is None:
             continue
+        if T_base_camera is not None and topic != (first := first or topic):
+            raise InputError(
+                f"{first} and {topic} hold depth images, and T_base_camera is the pose of one camera: name "
+                "its topic in topics"
+            )
         stamp = _seconds(message, at)
         location = f"the image of {topic} at {stamp:.3f} s"
         try:
@@ -244,7 +260,7 @@ def _seconds(message: Any, logged: int) -> float:
     return header_seconds(to_plain(message.header.stamp), logged)
 
 
-def _intrinsics(topic: str, info: Any, image: Any) -> tuple[float, float, float, float]:
+def _intrinsics(topic: str, info: Any, image: Any) -> Intrinsics:
     if info is None:
         raise InputError(f"there is no CameraInfo in the folder {_folder(topic)} for {topic}")
     if (info["width"], info["height"]) != (image.width, image.height):
@@ -348,19 +364,19 @@ class _States:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self._states: list[tuple[float, JointValues]] = []
+        self.known: list[tuple[float, JointValues]] = []
 
     def add(self, stamp: float, state: Mapping[str, Any]) -> None:
         """Add a message, if it has positions of all joints of the arm."""
         positions = dict(zip(state["name"], state["position"], strict=False))  # positions may be empty
         if all(name in positions for name in self._robot.joint_names):
             q = np.array([positions[name] for name in self._robot.joint_names])
-            insort(self._states, (stamp, q), key=itemgetter(0))
+            insort(self.known, (stamp, q), key=itemgetter(0))
 
     def at(self, stamp: float, where: str) -> Configuration:
         """The configuration at a time, interpolated. Raises InputError, naming `where`, if there is no joint
         state within MAX_GAP of the time."""
-        near = around(self._states, stamp)
+        near = around(self.known, stamp)
         if near is None:
             names = ", ".join(self._robot.joint_names)
             raise InputError(f"there is no joint state of {names} within {MAX_GAP:g} s of {where}")

@@ -6,7 +6,6 @@ motions through rosbridge.
 
 import csv
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path as FilePath
 from time import sleep
 from typing import Any
@@ -28,6 +27,7 @@ from robotdiffuse.core.types import (
     Values,
     check_increasing,
     check_motion_arrays,
+    frozen_dataclass,
 )
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
@@ -42,7 +42,7 @@ MAX_NAMES = 6
 """Largest number of joint names in a message."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class RecordedMotion:
     """A checked motion of any joints, in any order; velocities and accelerations that the recording lacks are
     None."""
@@ -94,7 +94,7 @@ def _empty(value: object) -> bool:
         return False
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class RobotMotion:
     """A recorded motion, converted to the planned joints of a robot, with notes on what the conversion
     changed or left out."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from robotdiffuse.core.errors import needs
 from robotdiffuse.core.files import write_atomically
-from robotdiffuse.core.transforms import quaternion_from_rotation
+from robotdiffuse.core.transforms import xyzw_of
 from robotdiffuse.core.types import Pose, Trajectory
 from robotdiffuse.drawables import Drawable, Surface, drawables, link_surfaces, own_frame
 from robotdiffuse.problems.problem import Problem
@@ -72,7 +72,7 @@ def _entity(obstacle: str) -> str:
 
 
 def _quaternion(T: Pose) -> rr.Quaternion:
-    return rr.Quaternion(xyzw=quaternion_from_rotation(T[:3, :3])[[1, 2, 3, 0]])
+    return rr.Quaternion(xyzw=xyzw_of(T))
 
 
 def _archetype(obstacle: Drawable) -> rr.AsComponents:

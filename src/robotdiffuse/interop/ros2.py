@@ -35,7 +35,7 @@ from robotdiffuse.core.files import (
     replaced_folder,
     write_atomically,
 )
-from robotdiffuse.core.transforms import quaternion_from_rotation
+from robotdiffuse.core.transforms import xyzw_of
 from robotdiffuse.core.types import Configuration, Pose, Trajectory
 from robotdiffuse.drawables import Color, Drawable, Surface, drawables, link_surfaces
 from robotdiffuse.interop.recorded_motion import (
@@ -205,17 +205,15 @@ def motion_from_messages(kind: str, messages: list[tuple[int, Any]], where: str)
         return motion_from_record(to_plain(messages[0][1]), where)
     states = [to_plain(message) for _, message in messages]
     names = states[0]["name"]
-    logged = messages[0][0]
     stamps = [header_seconds(state["header"]["stamp"]) for state in states]
     if not any(stamps):
-        stamps = [1e-9 * (at - logged) for at, _ in messages]
+        stamps = [1e-9 * (at - messages[0][0]) for at, _ in messages]
     rows: dict[str, list[list[float]]] = {"position": [], "velocity": []}
     for i, state in enumerate(states):
         if sorted(state["name"]) != sorted(names):
             mistake = f"joint state {i} has the joints {joined(state['name'])}"
             raise InputError(f"{where}: {mistake}; the first has {joined(names)}; all must have the same")
-        column_of = {name: k for k, name in enumerate(state["name"])}
-        order = [column_of[name] for name in names]
+        order = [state["name"].index(name) for name in names]
         for quantity, column in rows.items():
             column.append([state[quantity][k] for k in order] if len(state[quantity]) == len(names) else [])
     has_values = [len(row) > 0 for row in rows["velocity"]]
@@ -226,9 +224,9 @@ def motion_from_messages(kind: str, messages: list[tuple[int, Any]], where: str)
             f"{where}: {mistake}, other states have one for each; all must have one for each joint, or none"
         )
     velocities = rows["velocity"] if all(has_values) else None
-    first = stamps[0]
+    times = [stamp - stamps[0] for stamp in stamps]
     with reading(where):
-        return checked_motion(names, rows["position"], [stamp - first for stamp in stamps], velocities)
+        return checked_motion(names, rows["position"], times, velocities)
 
 
 # MCAP files
@@ -331,11 +329,6 @@ def _set(vector: Any, values: Sequence[float]) -> None:
         setattr(vector, axis, value)
 
 
-def _turn(T: Pose) -> list[float]:
-    """The rotation of a pose as a quaternion in the order x, y, z, w."""
-    return np.roll(quaternion_from_rotation(T[:3, :3]), -1).tolist()
-
-
 def _scene(robot: Robot, obstacles: Sequence[Drawable]) -> SceneUpdate:
     update = SceneUpdate()
 
@@ -362,7 +355,7 @@ def _scene(robot: Robot, obstacles: Sequence[Drawable]) -> SceneUpdate:
                 continue
         _set(solid.size, size)
         _set(solid.pose.position, shape.T_base_shape[:3, 3].tolist())
-        _set(solid.pose.orientation, _turn(shape.T_base_shape))
+        _set(solid.pose.orientation, xyzw_of(shape.T_base_shape).tolist())
         _set_color(solid.color, obstacle.color, OBSTACLE_OPACITY)
     for link, surface in link_surfaces(robot).items():
         for color, part in surface.by_color:
@@ -408,7 +401,7 @@ def _transforms(problem: Problem, poses: dict[str, Pose], at: int) -> FrameTrans
         transform = update.transforms.add(parent_frame_id=parent, child_frame_id=frame)
         transform.timestamp.FromNanoseconds(at)
         _set(transform.translation, T[:3, 3].tolist())
-        _set(transform.rotation, _turn(T))
+        _set(transform.rotation, xyzw_of(T).tolist())
     return update
 
 

@@ -225,7 +225,7 @@ def draw_sample(families: Sequence[str], robot: Robot, rng: Generator) -> tuple[
 def draw_samples(families: Sequence[str], robot: Robot, seeds: Sequence[int]) -> Samples:
     """A sample for each seed."""
     samples = [draw_sample(families, robot, np.random.default_rng(seed)) for seed in seeds]
-    return Samples(*(np.stack(arrays) for arrays in zip(*samples, strict=True)))
+    return Samples(*map(np.stack, zip(*samples, strict=True)))
 
 
 Completion = Callable[[ndarray, ndarray], ndarray]

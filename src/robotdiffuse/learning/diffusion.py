@@ -46,7 +46,8 @@ class NoiseSchedule:
     """Signal and noise of the levels t = 0 .. T; level 0 is the clean trajectory."""
 
     def __init__(self, settings: ScheduleSettings) -> None:
-        self.settings = settings
+        self.steps = settings.steps
+        """T."""
         t = np.arange(settings.steps + 1) / settings.steps
         curve = np.cos((t + settings.offset) / (1 + settings.offset) * np.pi / 2) ** 2
         alpha_bar = curve / curve[0]
@@ -59,11 +60,6 @@ class NoiseSchedule:
         with np.errstate(divide="ignore"):
             self.half_log_snr: Values = np.log(self.signal) - np.log(self.noise)
             """Half the logarithm of the signal-to-noise ratio; inf at level 0."""
-
-    @property
-    def steps(self) -> int:
-        """T."""
-        return self.settings.steps
 
     def weight(self, t: Int[ndarray, "n"], limit: float) -> Values:
         """Weight of the loss on x_0 at level t: 1 + SNR, at most `limit`.

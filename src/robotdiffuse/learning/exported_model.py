@@ -79,9 +79,9 @@ class ExportedModel(MotionModel):
         self._denoiser = networks[".onnx"]
         self._encoder = networks.get(".encoder.onnx")
         initial = Statistics.without_data(self.waypoints, self.dof)
-        self._statistics = initial._replace(**read_arrays(folder, name, about, Statistics._fields))
+        self.statistics = initial._replace(**read_arrays(folder, name, about, Statistics._fields))
         # networks and statistics must fit the description
-        fits = [a.shape == b.shape for a, b in zip(self._statistics, initial, strict=True)]
+        fits = [a.shape == b.shape for a, b in zip(self.statistics, initial, strict=True)]
         features = np.zeros((1, self.waypoints, self.feature_count), np.float32)
         condition = np.zeros((1, self.condition_count), np.float32)
         try:
@@ -93,11 +93,6 @@ class ExportedModel(MotionModel):
             raise InputError(f"{location} does not fit its ONNX files: {str(error)[:200]}") from None
         if not all(fits):
             raise InputError(f"{location} does not fit its weights: they are for other sizes")
-
-    @property
-    def statistics(self) -> Statistics:
-        """See `MotionModel`."""
-        return self._statistics
 
     def denoised(
         self,

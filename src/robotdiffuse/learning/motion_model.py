@@ -212,6 +212,9 @@ class MotionModel(ABC):
     are start and goal: they are written over the ends of x at every step (the paper's noise interpolation).
     """
 
+    statistics: Statistics
+    """The statistics of the training data; a subclass sets or computes them."""
+
     def __init__(self, robot: RobotIdentity, settings: MotionModelSettings) -> None:
         self.robot = robot
         self.settings = settings
@@ -222,11 +225,6 @@ class MotionModel(ABC):
         self.objective = OBJECTIVES[settings.objective]
         self.is_unit_joints = settings.target == "limits"
         """Whether x is the normalized joint values themselves, relative to nothing."""
-
-    @property
-    @abstractmethod
-    def statistics(self) -> Statistics:
-        """The statistics of the training data."""
 
     def clipped(self, x: Trajectories) -> Trajectories:
         """A predicted x, clipped to the joint limits for the target `limits`; unchanged for other targets."""

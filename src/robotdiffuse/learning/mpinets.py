@@ -313,7 +313,7 @@ class MPiNetsNetwork(BaselineNetwork):
         q = self.normalizer.from_unit(np.clip(self.normalizer.to_unit(q), -1, 1))
         scenes = data.scenes[rows]
         clouds = self.clouds(scenes, rng)
-        current, after, end = (torch.from_numpy(part) for part in (q, expert, goal))
+        current, after, end = map(torch.from_numpy, (q, expert, goal))
         return Steps(current, after, end, clouds, scenes)
 
     def clouds(self, scenes: PackedScenes, rng: Generator) -> Clouds:

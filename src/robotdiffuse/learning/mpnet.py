@@ -33,7 +33,7 @@ Differences from the paper:
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -42,7 +42,15 @@ from numpy import ndarray
 from torch import Generator, Tensor, nn
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings, Sizes
+from robotdiffuse.core.settings import (
+    Count,
+    Natural,
+    NotNegative,
+    Positive,
+    Settings,
+    ShareBelowOne,
+    Sizes,
+)
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.encoders import curve_keys
 from robotdiffuse.learning.network import Scalar
@@ -79,7 +87,7 @@ class MPNetSettings(Settings, name="mpnet"):
     """lambda, the weight of the contractive penalty [m^4]."""
     layers: Sizes = (768, 640, 512, 384, 320, 256, 192, 128, 128, 64, 32)
     """Widths of Pnet's layers (paper: 1280, 1024, 896, 768, 512, 384, 256, 256, 128, 64, 32)."""
-    dropout: Annotated[float, Bound(least=0.0, below=1.0)] = 0.25
+    dropout: ShareBelowOne = 0.25
     """Share of the outputs of Pnet's layers that is dropped, in planning and training (paper: 0.5, of wider
     layers)."""
     steady_layers: Natural = 2
@@ -184,7 +192,7 @@ class MPNetNetwork(BaselineNetwork):
             if fraction < PRETRAINING:
                 return self.autoencoder_loss(cloud, generator)
             z = self.encode(cloud).repeat_interleave(settings.waypoints, 0)
-            q, following, goal = (torch.from_numpy(a) for a in self.training_samples(data.q[rows], rng))
+            q, following, goal = map(torch.from_numpy, self.training_samples(data.q[rows], rng))
             x = self.to_unit(q)
             target = self.to_unit(goal)
             step = self.policy(torch.cat([z, x.to(z), target.to(z)], 1), generator)

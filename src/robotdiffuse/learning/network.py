@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from onnx import GraphProto
 
 Scalar = Float[Tensor, ""]
+Joints = Float[Tensor, "*batch dof"]
 EXPORT_PACKAGES = ("onnx", "onnxscript")
 """Packages that PyTorch's exporter needs."""
 LEAST_STORED_IN_HALF = 1024
@@ -44,11 +45,11 @@ class Network(SavedModule):
     settings: Any
     normalizer: JointNormalizer
 
-    def to_unit(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
+    def to_unit(self, q: Joints) -> Joints:
         """`JointNormalizer.to_unit` of a tensor, differentiable."""
         return (q - q.new_tensor(self.normalizer.middle)) / q.new_tensor(self.normalizer.half_range)
 
-    def from_unit(self, x: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
+    def from_unit(self, x: Joints) -> Joints:
         """`JointNormalizer.from_unit` of a tensor, differentiable."""
         return x * x.new_tensor(self.normalizer.half_range) + x.new_tensor(self.normalizer.middle)
 

@@ -116,7 +116,7 @@ def mistakes(view: DepthView) -> Iterator[tuple[str, DepthView]]:
             DepthView.from_cloud(placed(T, cloud), T),
         )
     inverse = np.linalg.inv(T)
-    wxyz = quaternion_from_rotation(T[:3, :3])
+    wxyz = quaternion_from_rotation(T)
     flipped = np.diag([1.0, -1.0, -1.0, 1.0])
     poses = {
         "T_base_camera is the inverse, T_camera_base": inverse,

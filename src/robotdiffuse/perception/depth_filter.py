@@ -5,14 +5,21 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32
+from jaxtyping import Bool, Float, Int32
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.core.errors import InputError, form, numbers, shown
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.types import Points, Values, for_kernels
-from robotdiffuse.perception.depth_view import FARTHEST, NEAREST, DepthNoise, DepthView
+from robotdiffuse.core.types import Points, Spheres, Values, for_kernels
+from robotdiffuse.perception.depth_view import (
+    FARTHEST,
+    NEAREST,
+    DepthImage,
+    DepthNoise,
+    DepthView,
+    Pixels,
+)
 
 MIN_RETURNS = 4
 """A pixel with a return is kept if its 3 x 3 neighborhood has at least this many returns, itself included."""
@@ -54,7 +61,13 @@ FLATNESS = 2.0
 variance of the noise. With a larger factor, small objects would be taken for noise."""
 
 
-def smoothed(depth: Float32[ndarray, "h w"], spread: float) -> tuple[Float32[ndarray, "h w"], float]:
+def _inverse_depths(depth: ndarray) -> tuple[ndarray, ndarray]:
+    """Which pixels have a return, and the inverse depth of these pixels; 0 for the others."""
+    seen = np.isfinite(depth) & (depth > 0)
+    return seen, np.divide(1.0, depth, out=np.zeros(depth.shape), where=seen)
+
+
+def smoothed(depth: DepthImage, spread: float) -> tuple[DepthImage, float]:
     """The image, smoothed on flat surfaces, and the share of smoothed pixels among the pixels with a return.
 
     If the square of SQUARE x SQUARE pixels around a pixel is flat, the pixel gets the depth of the plane
@@ -63,8 +76,7 @@ def smoothed(depth: Float32[ndarray, "h w"], spread: float) -> tuple[Float32[nda
     """
     from scipy.ndimage import correlate1d, uniform_filter, uniform_filter1d
 
-    seen = np.isfinite(depth) & (depth > 0)
-    inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=seen)
+    seen, inverse = _inverse_depths(depth)
     whole = uniform_filter(seen.astype(np.float32), SQUARE, mode="constant") > 1 - 0.5 / SQUARE**2
     mean = uniform_filter(inverse, SQUARE)
     variance = uniform_filter(inverse**2, SQUARE) - mean**2
@@ -108,7 +120,7 @@ class FilteredDepth(NamedTuple):
     """A filtered depth image, and the noise that it still has, as standard deviations of depth at a distance
     of 1 m [m]. Noise grows with the square of the distance."""
 
-    depth: Float32[ndarray, "h w"]
+    depth: DepthImage
     """Distance along the optical axis, as in DepthView [m]."""
     spread: float
     """Noise of all pixels with a return."""
@@ -147,7 +159,7 @@ def filtered(view: DepthView) -> FilteredDepth:
     return FilteredDepth(smooth, spread * float(np.sqrt(1 - flat_share * (1 - left))), spread)
 
 
-def patch_noise(depth: Float32[ndarray, "h w"]) -> tuple[float, float]:
+def patch_noise(depth: DepthImage) -> tuple[float, float]:
     """The standard deviation of an image's depth at a distance of 1 m [m], measured on flat patches, and the
     correlation of the errors of neighboring pixels; both are 0 if fewer than MIN_PATCHES patches have enough
     returns, as in images of 64 x 48 pixels.
@@ -158,13 +170,13 @@ def patch_noise(depth: Float32[ndarray, "h w"]) -> tuple[float, float]:
     rows, columns = (n // PATCH for n in depth.shape)
     cut = depth[: rows * PATCH, : columns * PATCH].reshape(rows, PATCH, columns, PATCH).swapaxes(1, 2)
     patches = cut.reshape(rows * columns, PATCH**2)
-    seen = np.isfinite(patches) & (patches > 0)
+    seen, inverse = _inverse_depths(patches)
     usable = np.flatnonzero(seen.mean(axis=1) >= MIN_PATCH_RETURNS)
     if len(usable) < MIN_PATCHES:
         return 0.0, 0.0
     usable = usable[:: -(-len(usable) // MAX_PATCHES)]
     seen = seen[usable]
-    inverse = np.divide(1.0, patches[usable], out=np.zeros(seen.shape), where=seen)
+    inverse = inverse[usable]
     v, u = (np.indices((PATCH, PATCH)).reshape(2, -1) - (PATCH - 1) / 2) / PATCH
     basis = np.stack([np.ones(PATCH**2), u, v])
     products = (basis[:, None] * basis[None]).reshape(9, -1)
@@ -219,9 +231,7 @@ def wide_regions(mask: Bool[ndarray, "*n"], width: int) -> Bool[ndarray, "*n"]:
     return maximum_filter(eroded, width, mode="nearest", origin=origin).view(np.bool_)
 
 
-def empty_regions(
-    depth: Float32[ndarray, "h w"], reach: float | None = None, arm: Bool[ndarray, "h w"] | None = None
-) -> Bool[ndarray, "h w"] | None:
+def empty_regions(depth: DepthImage, reach: float | None = None, arm: Pixels | None = None) -> Pixels | None:
     """The pixels without a return (0 or NaN) where nothing seems to be in range: large regions at the border
     of the image with no near surface beside them. None if there is no such pixel, or the image is cropped.
 
@@ -273,9 +283,7 @@ DEPTH_FACTOR = 1.5
 """Surfaces whose depths differ by less than this factor are widened by the same number of pixels."""
 
 
-def open_depth(
-    depth: Float32[ndarray, "h w"], arm: Bool[ndarray, "h w"], focal: float
-) -> Float32[ndarray, "h w"]:
+def open_depth(depth: DepthImage, arm: Pixels, focal: float) -> DepthImage:
     """The depths to assume for pixels without a return where nothing seems to be in range.
 
     They are infinite, except within GRAZED_WIDTH of a surface other than the arm. There they are -d, where d
@@ -346,14 +354,13 @@ def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
     if len(forms) < 2 or len({*forms}) > 1 or forms[0].count(" x ") != 1:
         raise InputError(f"images are {shown(forms)}; at least two images of one size, h x w, are needed")
     stack = np.array(arrays, np.float32)
-    seen = np.isfinite(stack) & (stack > 0)
+    seen, inverse = _inverse_depths(stack)
     always = np.equal(seen.sum(axis=0), len(stack))
     if not always.any():
         raise InputError("images: no pixel has a return in all of them")
     middle = np.median(stack[seen])
     if middle > FARTHEST:
         raise InputError(f"images have depths about {middle:.4g}; they must be in meters")
-    inverse = np.divide(1.0, stack, out=np.zeros(stack.shape), where=seen)
     changes = (inverse - inverse.mean(axis=0)) * np.sqrt(len(stack) / (len(stack) - 1))
     both = always[:, 1:] & always[:, :-1]
     variances = (changes**2).mean(axis=0)
@@ -389,7 +396,7 @@ def point_errors(views: Iterable[DepthView], points: Points) -> PointErrors:
     return errors
 
 
-def grown_for_errors(spheres: Float[ndarray, "n 4"], view: DepthView) -> Float[ndarray, "n 4"]:
+def grown_for_errors(spheres: Spheres, view: DepthView) -> Spheres:
     """The arm's spheres in the base frame, inflated by MARGIN_SPREADS times the noise of depth at their
     distance and by the error of the camera's pose."""
     T = view.T_base_camera

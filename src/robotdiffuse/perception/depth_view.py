@@ -30,8 +30,8 @@ from robotdiffuse.core.errors import (
     shown,
     vector,
 )
-from robotdiffuse.core.settings import Bound, Positive, Settings
-from robotdiffuse.core.transforms import placed
+from robotdiffuse.core.settings import Bound, Positive, Settings, ShareBelowOne
+from robotdiffuse.core.transforms import placed, seen_from
 from robotdiffuse.core.types import Configuration, Points, Pose, Value, frozen_dataclass, no_type_check
 from robotdiffuse.scenes.shapes import PointCloud
 
@@ -47,6 +47,14 @@ return"."""
 MAX_ANGLE = 0.5
 """Largest angle that `DepthView.pose_deviation` may state [rad]."""
 INTRINSICS = ("fx", "fy", "cx", "cy")
+DepthImage = Float32[ndarray, "h w"]
+"""[m]"""
+Pixels = Bool[ndarray, "h w"]
+"""Which pixels of an image are meant."""
+Intrinsics = tuple[float, float, float, float]
+"""fx, fy, cx, cy [pixels]."""
+Source = dict[str, str | float]
+"""The entry of a view in problem files."""
 # Maximum size of the image that is made of a point cloud; sparse clouds get coarser images [pixels].
 MAX_CLOUD_WIDTH = 320
 MAX_CLOUD_HEIGHT = 240
@@ -67,9 +75,9 @@ class DepthView(Value):
             `pose_deviation` or one with an angle above MAX_ANGLE, and a `noise` that is no DepthNoise.
     """
 
-    depth: Float32[ndarray, "h w"]
+    depth: DepthImage
     """Distance along the optical axis [m]."""
-    intrinsics: tuple[float, float, float, float]
+    intrinsics: Intrinsics
     """fx, fy, cx, cy [pixels]; pixel centers have integer coordinates. A mapping from these names to values
     and a camera matrix of 3 x 3 are accepted as well."""
     T_base_camera: Pose
@@ -79,7 +87,7 @@ class DepthView(Value):
     cloud: Points | None = None
     """The original points [m], if the image was made from a cloud; in the image, each pixel holds only its
     nearest point."""
-    source: dict[str, str | float] | None = None
+    source: Source | None = None
     """The image's entry in problem files: a file as `depth`, and its `scale`; or a file as `cloud`."""
     range: float | None = None
     """Largest distance that the sensor measures [m]. If it is given, large regions of 0 or NaN at the border
@@ -106,16 +114,15 @@ class DepthView(Value):
             )
         check_type("view.noise", self.noise, (DepthNoise, type(None)), "what rd.measure_noise returns")
         depth = np.where(depth > MAX_COORDINATE, np.inf, depth).astype(np.float32)
-        for key, value in {
-            "depth": depth,
-            "intrinsics": checked_intrinsics("view", self.intrinsics),
-            "T_base_camera": rigid_transform("view.T_base_camera", self.T_base_camera),
-            "configuration": configuration,
-            "range": None if self.range is None else positive("view", "range", self.range),
-            "cloud": None if self.cloud is None else points("view", "cloud", self.cloud),
-            "pose_deviation": tuple(deviation.tolist()),
-        }.items():
-            object.__setattr__(self, key, value)
+        self.__dict__.update(
+            depth=depth,
+            intrinsics=checked_intrinsics("view", self.intrinsics),
+            T_base_camera=rigid_transform("view.T_base_camera", self.T_base_camera),
+            configuration=configuration,
+            range=None if self.range is None else positive("view", "range", self.range),
+            cloud=None if self.cloud is None else points("view", "cloud", self.cloud),
+            pose_deviation=tuple(deviation.tolist()),
+        )
         super().__post_init__()
 
     if TYPE_CHECKING:
@@ -127,7 +134,7 @@ class DepthView(Value):
             T_base_camera: ArrayLike,
             configuration: ArrayLike | None = None,
             cloud: Points | None = None,
-            source: dict[str, str | float] | None = None,
+            source: Source | None = None,
             range: float | None = None,
             noise: "DepthNoise | None" = None,
             pose_deviation: ArrayLike = (0.0, 0.0),
@@ -169,7 +176,7 @@ class DepthView(Value):
         points: Points,
         T_base_camera: Pose,
         configuration: Configuration | None = None,
-        source: dict[str, str | float] | None = None,
+        source: Source | None = None,
     ) -> "DepthView":
         """Make the depth image that a camera would take of a point cloud.
 
@@ -192,7 +199,7 @@ class DepthView(Value):
         """
         T = rigid_transform("view.T_base_camera", T_base_camera)
         points = rows("view.points", points, None, 3)
-        in_camera = (points - T[:3, 3]) @ T[:3, :3]
+        in_camera = seen_from(T, points)
         z = in_camera[:, 2]
         in_front = z > 1e-3
         if not in_front.any():
@@ -221,7 +228,7 @@ def unprojected(view: DepthView, u: ndarray, v: ndarray, z: ndarray) -> Points:
     return np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1)
 
 
-def checked_intrinsics(owner: str, given: object) -> tuple[float, float, float, float]:
+def checked_intrinsics(owner: str, given: object) -> Intrinsics:
     """fx, fy, cx, cy [pixels] from four numbers, a mapping or a camera matrix, the field `intrinsics` of
     `owner`. Raises InputError for anything else, skew, and focal lengths below MIN_FOCAL_LENGTH."""
     if isinstance(given, Mapping):
@@ -253,7 +260,6 @@ class AssumedPoints(PointCloud):
     """Points of unknown space that an assumption treats as occupied."""
 
 
-ShareBelowOne = Annotated[float, Bound(least=0.0, below=1.0)]
 Angle = Annotated[float, Bound(least=0.0, below=np.pi / 2)]
 
 
@@ -311,7 +317,7 @@ class DepthNoise(Settings, name="depth_noise"):
             depth[np.isinf(depth)] = 0.0
         return replace(view, depth=depth, source=None)
 
-    def _grazed(self, view: DepthView) -> Bool[ndarray, "h w"]:
+    def _grazed(self, view: DepthView) -> Pixels:
         """Pixels that see their surface at a smaller angle than `grazing`."""
         depth = np.where(np.isfinite(view.depth) & (view.depth > 0), view.depth, np.nan).astype(np.float64)
         steepness = np.zeros_like(depth)

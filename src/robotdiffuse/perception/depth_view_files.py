@@ -40,7 +40,7 @@ from robotdiffuse.core.files import (
     read_yaml,
 )
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
-from robotdiffuse.perception.depth_view import INTEGER_NO_RETURN, INTRINSICS, DepthNoise, DepthView
+from robotdiffuse.perception.depth_view import INTEGER_NO_RETURN, INTRINSICS, DepthNoise, DepthView, Source
 from robotdiffuse.scenes.files import check_fields, name_from
 from robotdiffuse.scenes.point_cloud import read_points
 
@@ -200,7 +200,7 @@ def read_views(entries: object, folder: Path) -> tuple[tuple[DepthView, ...], tu
 
 
 def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthView:
-    source: dict[str, str | float] | None = None
+    source: Source | None = None
     is_cloud = isinstance(entry, dict) and "cloud" in entry
     required = ("cloud", "camera") if is_cloud else ("depth", "camera")
     optional = ("configuration", "pose_deviation", "range", "noise", *(() if is_cloud else IMAGE_FIELDS))
@@ -246,11 +246,21 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
     return DepthView(image, intrinsics, T_base_camera, configuration, source=source, **optional_fields)
 
 
+def _is_that_of_file(view: DepthView) -> bool:
+    """Whether a view's image is still that of its file, as `dataclasses.replace` keeps the source."""
+    source: Any = view.source
+    try:
+        image = read_depth(source["depth"], source.get("scale"))
+    except InputError:
+        return False
+    return np.array_equal(replace(view, depth=image).depth, view.depth, equal_nan=True)
+
+
 def view_entry(view: DepthView, folder: Path | None) -> JsonObject:
     """The entry of a view, in the form that `read_views` reads. Data that were read from a file are written
     as the file's name, relative to the folder."""
     entry: JsonObject = {}
-    if view.source is not None:
+    if view.source is not None and (view.cloud is not None or _is_that_of_file(view)):
         entry |= {
             name: name_from(folder, Path(value)) if isinstance(value, str) else value
             for name, value in view.source.items()

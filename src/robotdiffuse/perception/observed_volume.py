@@ -5,7 +5,6 @@ Each voxel is projected into the image; rays are not followed through the voxels
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -14,7 +13,8 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.types import Configuration
+from robotdiffuse.core.transforms import seen_from
+from robotdiffuse.core.types import Configuration, frozen_dataclass
 from robotdiffuse.perception.depth_filter import (
     empty_regions,
     filtered,
@@ -22,8 +22,8 @@ from robotdiffuse.perception.depth_filter import (
     open_depth,
     shows_surface,
 )
-from robotdiffuse.perception.depth_view import NEAREST, DepthView
-from robotdiffuse.perception.ray_caster import balls, in_camera, rectangle, render_depth
+from robotdiffuse.perception.depth_view import NEAREST, DepthImage, DepthView
+from robotdiffuse.perception.ray_caster import FASTMATH, balls, in_camera, rectangle, render_depth
 from robotdiffuse.perception.voxel_grid import COARSE, SHAPE, VoxelGrid
 from robotdiffuse.robots.robot import Robot
 
@@ -62,8 +62,6 @@ PIXEL_SLACK = np.float32(0.01)
 """Larger than the rounding errors of image coordinates [pixels]."""
 DEPTH_SLACK = np.float32(1e-4)
 """Larger than the rounding errors of depths [m]."""
-FASTMATH = {"contract", "reassoc", "arcp", "nsz"}
-"""The fastmath flags that do not assume finite numbers, without approximate functions (afn)."""
 _HALF = np.float32(0.5)
 _ONE = np.float32(1.0)
 _ZERO = np.float32(0.0)
@@ -123,7 +121,7 @@ def _arm_pixels(depth, intrinsics, spheres):
 
 def usable_image(
     view: DepthView, robot: Robot, q: Configuration, margin: float
-) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "n 4"]]:
+) -> tuple[DepthImage, Float32[ndarray, "n 4"]]:
     """The view's filtered image, and the arm's spheres in the camera's frame, inflated by the margin [m], by
     noise and by the error of the camera's pose.
 
@@ -135,12 +133,13 @@ def usable_image(
     depth = filtered(view).depth
     arm = robot.placed_spheres(q)
     spheres = grown_for_errors(arm, view)
-    spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
+    spheres[:, :3] = seen_from(T, spheres[:, :3])
     spheres[:, 3] += margin
     spheres = spheres.astype(np.float32)
     intrinsics = np.array(view.intrinsics, np.float32)
     arm_pixels = _arm_pixels(depth, intrinsics, spheres)
-    empty = empty_regions(view.depth, view.range, arm_pixels)
+    # without a surface in the image, the camera may be covered
+    empty = empty_regions(view.depth, view.range, arm_pixels) if shows_surface(view) else None
     if empty is not None:
         opening = EMPTY if view.range is None else open_depth(depth, arm_pixels, view.intrinsics[0])
         depth = np.where(empty, opening, depth)
@@ -491,6 +490,7 @@ def add_evidence(state, counts, evidence, hit, miss, largest):
     return new
 
 
+CoarseVoxels = Bool[ndarray, "56 56 32"]
 ARM_MARGIN = 0.015
 """Points within this distance of the arm's covering spheres are points of the arm [m]; more with noise: see
 `grown_for_errors`."""
@@ -500,27 +500,27 @@ inflated by the whole error. The inflated surfaces cover most wrongly free voxel
 cover those right behind an edge."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class ObservedVolume:
     """The states of coarse voxels according to views. Voxels neither occupied nor free are unknown."""
 
-    occupied: Bool[ndarray, "56 56 32"]
+    occupied: CoarseVoxels
     """The voxel contains points that are not the arm's."""
-    free: Bool[ndarray, "56 56 32"]
+    free: CoarseVoxels
     """A view observed the whole voxel as free."""
-    shadow: Bool[ndarray, "56 56 32"]
+    shadow: CoarseVoxels
     """The voxel is unknown, and behind the arm in some view."""
-    out_of_view: Bool[ndarray, "56 56 32"]
+    out_of_view: CoarseVoxels
     """The voxel is outside all images."""
     behind: Float32[ndarray, "56 56 32"]
     """How far the voxel is behind an observed surface, the minimum over all views [m]; 0 if it is behind
     none, or observed."""
-    lost: Bool[ndarray, "56 56 32"]
+    lost: CoarseVoxels
     """The voxel is unknown, and in some view its ray has no return (so something may be in range) or meets a
     surface nearer than LENS_DISTANCE. It is behind no other surface in any view."""
 
     @cached_property
-    def unknown(self) -> Bool[ndarray, "56 56 32"]:
+    def unknown(self) -> CoarseVoxels:
         return ~(self.occupied | self.free)
 
 

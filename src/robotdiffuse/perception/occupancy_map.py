@@ -8,7 +8,7 @@ start and goals is removed from them (carved out).
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -19,7 +19,7 @@ from robotdiffuse.collision.kernel_arrays import reach_bound
 from robotdiffuse.core import errors
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.locked import locked
-from robotdiffuse.core.types import Configuration, Path, Points, Values
+from robotdiffuse.core.types import Configuration, Path, Points, Values, frozen_dataclass
 from robotdiffuse.perception.depth_filter import PointErrors, filtered, point_errors, wide_regions
 from robotdiffuse.perception.depth_view import AssumedPoints, DepthView
 from robotdiffuse.perception.observed_volume import (
@@ -54,6 +54,8 @@ from robotdiffuse.perception.voxel_grid import (
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
+ArmSpheres = Float32[ndarray, "n 4"]
+"""The arm's covering spheres: rows of center x y z and radius [m]."""
 PADDINGS = (0.09, 0.06, 0.04)
 """Radii to which observed points are inflated, the largest first [m]."""
 # Points nearer to the arm's covering spheres at start or goals than PADDING_FACTOR times their padding plus
@@ -66,7 +68,7 @@ CARVING_MARGIN = 0.02
 """Voxels nearer to the arm's covering spheres at start or goals than this are carved out [m]."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Padded:
     """Observed points, inflated."""
 
@@ -78,17 +80,17 @@ class Padded:
     def name(self) -> str:
         return f"points padded by {100 * self.padding:.0f} cm"
 
-    def touched(self, spheres: Float32[ndarray, "n 4"]) -> Bool[ndarray, "points"]:
+    def touched(self, spheres: ArmSpheres) -> Bool[ndarray, "points"]:
         """Which points touch the arm's covering spheres (x, y, z, radius [m]) at start or goals and have to
         be carved out."""
         return sphere_distances(self.points, spheres) < PADDING_FACTOR * self.padding + PADDING_MARGIN
 
-    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
+    def obstacles(self, spheres: ArmSpheres) -> AssumedPoints:
         """The obstacles without those that touch these spheres."""
         return AssumedPoints(self.points[~self.touched(spheres)], self.padding, name="padded")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class OccupiedVoxels:
     """Voxels of the observed volume, coarse or fine, that an assumption takes for occupied."""
 
@@ -102,11 +104,11 @@ class OccupiedVoxels:
     def grid(self) -> VoxelGrid:
         return COARSE if self.occupied.shape == SHAPE else FINE
 
-    def touched(self, spheres: Float32[ndarray, "n 4"]) -> Voxels:
+    def touched(self, spheres: ArmSpheres) -> Voxels:
         """Which voxels touch these spheres and have to be carved out."""
         return self.occupied & self.grid.within(spheres, CARVING_MARGIN + self.grid.edge / 2)
 
-    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
+    def obstacles(self, spheres: ArmSpheres) -> AssumedPoints:
         """The occupied voxels at the boundary of the occupied region; the arm, which starts outside, cannot
         reach inner ones. Voxels out of the arm's reach or in the known scene are left out."""
         edge = self.grid.edge
@@ -173,14 +175,16 @@ class UnknownSpace:
 
     def crossed(self, path: Path) -> "CrossedSpace":
         """The unknown voxels that the arm passes through on a path."""
-        swept = self._grid.swept(self._robot, path) & self._elsewhere
+        swept, leaves = self._grid.swept_and_left(self._robot, path)
+        swept &= self._elsewhere
         crossed = swept & self.unknown
         swept_count = max(int(swept.sum()), 1)
         lost = 0.0 if self._lost is None else float((crossed & self._lost).sum()) / swept_count
-        return CrossedSpace(crossed, self.probability, self._grid, lost, float(crossed.sum()) / swept_count)
+        unseen = float(crossed.sum()) / swept_count
+        return CrossedSpace(crossed, self.probability, self._grid, lost, unseen, leaves)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class CrossedSpace:
     """The unknown space that a motion passes through."""
 
@@ -192,6 +196,20 @@ class CrossedSpace:
     """Fraction of the voxels on the motion that are in lost regions."""
     unseen_share: float = 0.0
     """Fraction of the voxels on the motion that no view saw."""
+    leaves: bool = False
+    """Whether the arm leaves the grid, beyond which views are not evaluated."""
+
+    @property
+    def blind(self) -> str:
+        """Why views say too little about the motion; "" if they say enough."""
+        if self.leaves:
+            return (
+                "the motion leaves the space in which views are evaluated: 1.12 m to each side of the base, "
+                "from 0.1 m below to 1.18 m above it"
+            )
+        if self.unseen_share > MAX_UNSEEN_SHARE:
+            return "the views see hardly anything of the space that the motion crosses"
+        return ""
 
     @cached_property
     def risk(self) -> float | None:
@@ -221,7 +239,7 @@ RATES: dict[str, float] = {
 the true scene. `python benchmarks/cameras.py --fit` prints these from its problems with even numbers."""
 
 UNSEEN_CONFIDENCE = 0.5
-"""Largest confidence of a motion with an unseen share above MAX_UNSEEN_SHARE."""
+"""Largest confidence of a motion about which views say too little; see `CrossedSpace.blind`."""
 MAX_UNSEEN_SHARE = 0.99
 
 # The log odds that a motion is free in the true scene are the first number plus the second times log(risk).
@@ -246,14 +264,14 @@ def confidence(assumption: str, crossed: CrossedSpace) -> float:
 
     It follows from the risk. Without a prediction, it is the rate of the assumption in RATES, reduced in
     proportion to the share of lost regions in the space that the motion passes through. It is at most
-    UNSEEN_CONFIDENCE if views saw hardly any of this space.
+    UNSEEN_CONFIDENCE if views say too little about this space.
     """
     stated = (
         RATES[assumption] * (1 - crossed.lost_share)
         if crossed.risk is None
         else probability_free(crossed.risk, ONE_VIEW)
     )
-    return min(stated, UNSEEN_CONFIDENCE) if crossed.unseen_share > MAX_UNSEEN_SHARE else stated
+    return min(stated, UNSEEN_CONFIDENCE) if crossed.blind else stated
 
 
 Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -318,6 +336,8 @@ class OccupancyMap:
         InputError if the view has none, or one of the wrong length.
         """
         q = self.configuration_of(view)
+        if stamp < self.oldest:  # already forgotten
+            return 0
         state, _, counts = carve_view(view, self.robot, q, MAP)
         new_voxels = self._update(state, counts, stamp, [view])
         if any(view.pose_deviation):
@@ -343,6 +363,8 @@ class OccupancyMap:
         but n x 3 numbers."""
         at = MAP.indices(errors.points("map", "points", points))
         at = at[MAP.contains(at)]
+        if stamp < self.oldest:  # already forgotten
+            return
         counts = np.zeros(MAP.shape, np.int32)
         counts[tuple(at.T)] = 1
         self._update(np.full(MAP.shape, HIDDEN, np.uint8), counts, stamp)
@@ -462,7 +484,7 @@ ALONE_DISTANCE = 0.02
 [m]. On surfaces at 1 m, 99 of 100 points have at least three others within this distance."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class _RememberedView:
     """A view, and what it observes, computed when it is first needed."""
 
@@ -557,5 +579,4 @@ def _cells(points: Points) -> ndarray:
     """The number of the cell of CELL edge length that contains each point; equal numbers mean one cell."""
     at = np.floor(points / CELL).astype(np.int64)
     at -= at.min(axis=0, initial=0)
-    _, ny, nz = at.max(axis=0, initial=0) + 1
-    return (at[:, 0] * ny + at[:, 1]) * nz + at[:, 2]
+    return np.asarray(np.ravel_multi_index(tuple(at.T), tuple(at.max(axis=0, initial=0) + 1)))

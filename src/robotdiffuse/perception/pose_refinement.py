@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from robotdiffuse.core.errors import InputError, check_list
 from robotdiffuse.core.transforms import placed, transform
-from robotdiffuse.core.types import Configuration, Mask, Points, Pose, Values
+from robotdiffuse.core.types import Configuration, Mask, Points, Pose, Values, frozen_dataclass
 from robotdiffuse.perception.camera_check import (
     BETTER,
     MIN_CELLS,
@@ -38,7 +38,7 @@ from robotdiffuse.perception.voxel_grid import MAP
 from robotdiffuse.robots.robot import Robot, check_robot
 from robotdiffuse.scenes.scene import Scene
 
-ARM_GATES = np.geomspace(0.15, 0.012, 25)
+ARM_GATES = np.geomspace(0.15, 0.012, 60)
 """For each round of the estimate, the distance beyond which points are too far from the arm to count [m]."""
 MIN_POINTS = 1500
 """Every k-th of a view's points near the arm is used, with the largest k that leaves at least this many."""
@@ -51,7 +51,7 @@ ARM_POINTS_PER_ERROR = 25
 neighboring points are correlated."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class CameraCalibration:
     """The pose of a camera, estimated from views of the arm."""
 
@@ -263,7 +263,7 @@ class _Camera:
     """Covariance of the estimate."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class _Image:
     """The parts of a view that the estimate uses."""
 

@@ -4,15 +4,15 @@ For each shape, rays are cast through the pixels that it may cover.
 """
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.core.types import Configuration, Pose
-from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.core.types import Configuration, Pose, Spheres, Vector
+from robotdiffuse.perception.depth_view import DepthView, Intrinsics
 from robotdiffuse.perception.voxel_grid import VoxelGrid, Voxels
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -20,6 +20,8 @@ from robotdiffuse.scenes.shapes import PointCloud, Triangulated
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
+FASTMATH = {"contract", "reassoc", "arcp", "nsz"}
+"""The fastmath flags that do not assume finite numbers, without approximate functions (afn)."""
 # Surfaces nearer to the camera than this are not rendered [m].
 _NEAR = np.float32(0.02)
 _MISS = np.float32(1e9)
@@ -57,7 +59,7 @@ def rectangle(x, y, z, r, intrinsics, h, w):
     return int(v0), int(v1), int(u0), int(u1)
 
 
-@kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
+@kernel(fastmath=FASTMATH)
 def _quadratic(a, b, c, last):
     """The smaller root of a t^2 + 2 b t + c, or the larger root if `last`; _MISS if there is no root."""
     under = b * b - a * c
@@ -67,13 +69,13 @@ def _quadratic(a, b, c, last):
     return (root - b if last else -root - b) / a
 
 
-@kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
+@kernel(fastmath=FASTMATH)
 def _sphere(ox, oy, oz, dx, dy, dz, r):
     c = ox * ox + oy * oy + oz * oz - r * r
     return _quadratic(dx * dx + dy * dy + dz * dz, ox * dx + oy * dy + oz * dz, c, False)
 
 
-@kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
+@kernel(fastmath=FASTMATH)
 def _slab(o, d, half):
     """The parameters at which a ray enters and leaves |x| < half."""
     if abs(d) < np.float32(1e-9):
@@ -83,7 +85,7 @@ def _slab(o, d, half):
     return min(a, b), max(a, b)
 
 
-@kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
+@kernel(fastmath=FASTMATH)
 def _intersect(solid, ox, oy, oz, dx, dy, dz):
     """The parameter t at which the ray o + t d, in the frame of a solid, enters the solid; or _MISS.
 
@@ -127,7 +129,7 @@ def _radius(solid):
     return np.sqrt(solid[12] ** 2 + solid[13] ** 2 + solid[14] ** 2) + solid[15]
 
 
-@kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
+@kernel(fastmath=FASTMATH)
 def render_depth(solids, intrinsics, T, depth):
     """Lowers each pixel of `depth` [h w] to the depth of the nearest of `SceneArrays.solids`.
 
@@ -210,7 +212,7 @@ MAX_RANGE = 4.0
 """Range of rendered cameras [m]."""
 
 
-def looking_at(position: Float[ndarray, "3"], target: Float[ndarray, "3"], roll: float = 0.0) -> Pose:
+def looking_at(position: Vector, target: Vector, roll: float = 0.0) -> Pose:
     """T_base_camera of a camera at `position` that looks at `target`, upright except for `roll` [rad].
 
     x is to the right in the image, y down, z forward. If the camera looks straight down, the top of the image
@@ -228,7 +230,7 @@ def looking_at(position: Float[ndarray, "3"], target: Float[ndarray, "3"], roll:
 def ray_cast(
     scene: Scene,
     T_base_camera: Pose,
-    intrinsics: tuple[float, float, float, float],
+    intrinsics: Intrinsics,
     size: tuple[int, int],
     robot: Robot | None = None,
     configuration: Configuration | None = None,
@@ -247,7 +249,7 @@ def ray_cast(
     return DepthView(depth, intrinsics, T_base_camera, configuration)
 
 
-def balls(spheres: Float[ndarray, "n 4"]) -> Float32[ndarray, "n 17"]:
+def balls(spheres: Spheres) -> Float32[ndarray, "n 17"]:
     """Spheres (x, y, z, radius [m]) as rows of `SceneArrays.solids`."""
     rows = np.zeros((len(spheres), 17), np.float32)
     rows[:, [0, 1, 2, 15]] = spheres

@@ -4,13 +4,13 @@ grid. A hash table holds the cells."""
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
 from robotdiffuse.collision.kernels.collision_cost import scene_distance
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.types import Configuration, Configurations, Points, for_kernels
+from robotdiffuse.core.types import Configuration, Configurations, Mask, Points, for_kernels
 from robotdiffuse.perception.depth_filter import PointErrors, filtered, grown_for_errors, point_errors
 from robotdiffuse.perception.depth_view import NEAREST, DepthView, SeenPoints
 from robotdiffuse.robots.frame_kernel import write
@@ -224,7 +224,7 @@ def nearest_surfaces(robot: Robot, scene: Scene, points: Points, limit: float) -
     return _nearest_surfaces(arrays, points.astype(np.float32), np.float32(limit))
 
 
-def near_scene(robot: Robot, scene: Scene, points: Points, limit: float) -> Bool[ndarray, "n"]:
+def near_scene(robot: Robot, scene: Scene, points: Points, limit: float) -> Mask:
     """Which points are inside an obstacle, or nearer to one than `limit` [m]."""
     return nearest_surfaces(robot, scene, points, limit)[:, 0] < np.float32(limit)
 

@@ -4,7 +4,7 @@ balls an image shows to be empty; these balls cover the arm's surface at a goal.
 from itertools import product
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import Part, parts_of
@@ -14,7 +14,8 @@ from robotdiffuse.collision.kernels.collision_cost import frames_of
 from robotdiffuse.collision.kernels.collision_cost import placed as placed_point
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.transforms import placed
-from robotdiffuse.core.types import Configuration, Configurations, Points
+from robotdiffuse.core.types import Configuration, Configurations, Mask, Points, Values, Vector
+from robotdiffuse.perception.depth_view import Intrinsics
 from robotdiffuse.perception.observed_volume import MAX_DEPTH, usable_depth
 from robotdiffuse.perception.ray_caster import in_camera, render_depth
 from robotdiffuse.perception.voxel_grid import Probabilities, VoxelGrid, Voxels
@@ -102,14 +103,14 @@ def seen_share(
     robot: Robot,
     configurations: Configurations,
     poses: Float[ndarray, "n 4 4"],
-    intrinsics: tuple[float, float, float, float],
+    intrinsics: Intrinsics,
     size: tuple[int, ...],
     reach: float,
     voxels: Int[ndarray, "m 3"],
     weights: Float32[ndarray, "m"],
     filled: Probabilities,
     grid: VoxelGrid,
-) -> Float[ndarray, "n"]:
+) -> Values:
     """The fraction of the voxels' total weight that a camera sees from each pose, with the arm at the
     configuration of the same row; the other arguments are those of `seen_weights`."""
     sums = seen_weights(
@@ -198,7 +199,7 @@ def _all_behind(depth, v0, v1, u0, u1, min_return):
     return True
 
 
-def within_voxels(balls: Points, radius: float, marked: Voxels, grid: VoxelGrid) -> Bool[ndarray, "n"]:
+def within_voxels(balls: Points, radius: float, marked: Voxels, grid: VoxelGrid) -> Mask:
     """Which balls lie entirely in marked voxels of the grid. radius: at most half a voxel's edge [m]."""
     corners = balls[:, None] + list(product((-radius, radius), repeat=3))
     return np.asarray(grid.hold(marked, corners.reshape(-1, 3)).reshape(-1, 8).all(axis=1))
@@ -248,7 +249,7 @@ def _triangle(corners: Float[ndarray, "3 3"]) -> Points:
     return weights @ corners
 
 
-def _sphere(center: Float[ndarray, "3"], radius: float) -> Points:
+def _sphere(center: Vector, radius: float) -> Points:
     """Points on a sphere, along a spiral, about SAMPLE_DISTANCE apart."""
     count = max(int(4 * np.pi * (radius / SAMPLE_DISTANCE) ** 2), 1)
     z = 1 - (2 * np.arange(count) + 1) / count

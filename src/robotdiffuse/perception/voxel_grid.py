@@ -10,12 +10,14 @@ from numpy import ndarray
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.collision.kernels.collision_cost import frames_of, placed
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.types import Configuration, Path, Points
+from robotdiffuse.core.types import Configuration, Mask, Path, Points, Spheres
 from robotdiffuse.robots.robot import Robot
 
 Voxels = Bool[ndarray, "nx ny nz"]
 Probabilities = Float32[ndarray, "nx ny nz"]
 """The probability that each voxel is occupied."""
+Indices = Int[ndarray, "n 3"]
+"""Indices of voxels along x, y and z."""
 VOXEL = 0.04
 """Edge length of a coarse voxel [m]."""
 LOW = (-1.12, -1.12, -0.1)
@@ -50,28 +52,26 @@ class VoxelGrid:
         """The lower corner and the edge as float32, for compiled code."""
         return np.array(self.low, np.float32), np.float32(self.edge)
 
-    def centers(self, at: Int[ndarray, "n 3"]) -> Points:
+    def centers(self, at: Indices) -> Points:
         """The centers of the voxels with these indices [m]."""
         return (at + 0.5) * self.edge + self.low
 
-    def indices(self, points: Points) -> Int[ndarray, "n 3"]:
+    def indices(self, points: Points) -> Indices:
         """The indices of the voxels that contain points of the base frame; they may be outside the grid."""
         return np.floor((points - self.low) / self.edge).astype(np.int64)
 
-    def contains(self, at: Int[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
+    def contains(self, at: Indices) -> Mask:
         """Which of these indices are inside the grid."""
         return np.asarray(((at >= 0) & (at < self.shape)).all(axis=1))
 
-    def hold(self, marked: Voxels, points: Points) -> Bool[ndarray, "n"]:
+    def hold(self, marked: Voxels, points: Points) -> Mask:
         """Whether each point is in one of the marked voxels."""
         at = self.indices(points)
         marks = self.contains(at)
         marks[marks] = marked[tuple(at[marks].T)]
         return marks
 
-    def enclose(
-        self, marked: Voxels, points: Points, distance: "float | Float[ndarray, 'n']"
-    ) -> Bool[ndarray, "n"]:
+    def enclose(self, marked: Voxels, points: Points, distance: "float | Float[ndarray, 'n']") -> Mask:
         """Whether each point is in a marked voxel, with marked voxels on all six sides at a distance [m]."""
         sides = np.vstack([np.eye(4, 3), -np.eye(3)])  # the fourth is zero
         return np.all([self.hold(marked, points + np.outer(distance, side)) for side in sides], axis=0)
@@ -81,7 +81,7 @@ class VoxelGrid:
         configurations."""
         return self.within(np.concatenate([robot.placed_spheres(q) for q in configurations]), margin)
 
-    def within(self, spheres: Float[ndarray, "n 4"], margin: float = 0.0) -> Voxels:
+    def within(self, spheres: Spheres, margin: float = 0.0) -> Voxels:
         """Voxels with their centers in spheres, inflated by `margin` [m]."""
         out = np.zeros(self.shape, np.bool_)
         mark(spheres.astype(np.float32) + np.array([0, 0, 0, margin], np.float32), *self.frame, out)
@@ -93,6 +93,15 @@ class VoxelGrid:
         out = np.zeros(self.shape, np.bool_)
         sweep(compile_robot(robot), path.positions.astype(np.float32), np.float32(margin), *self.frame, out)
         return out
+
+    def swept_and_left(self, robot: Robot, path: Path) -> tuple[Voxels, bool]:
+        """The voxels of `swept`, and whether the links also sweep space next to the grid."""
+        x, y, z = self.low
+        nx, ny, nz = self.shape
+        low = (x - self.edge, y - self.edge, z - self.edge)
+        larger = VoxelGrid(low, (nx + 2, ny + 2, nz + 2), self.edge).swept(robot, path)
+        inside = larger[1:-1, 1:-1, 1:-1]
+        return inside, bool(larger.sum() > inside.sum())
 
 
 COARSE = VoxelGrid(LOW, SHAPE, VOXEL)
@@ -159,7 +168,7 @@ def mark(spheres, low, voxel, marked):
         _mark(spheres[s, 0], spheres[s, 1], spheres[s, 2], spheres[s, 3], low, voxel, marked)
 
 
-def surface(marked: Voxels) -> Int[ndarray, "n 3"]:
+def surface(marked: Voxels) -> Indices:
     """Indices of the marked voxels that share a face with an unmarked voxel of the grid, in the order of the
     array."""
     padded = np.pad(marked, 1, constant_values=True)

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from numbers import Real
 from typing import Annotated, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -101,8 +100,6 @@ def time_left(time_limit: float, began: float) -> float:
 
     At least MIN_TIME_LIMIT, or the time limit itself if it is less.
     """
-    if not isinstance(time_limit, Real):
-        return time_limit  # `PlanRequest` refuses it
     return min(time_limit, max(time_limit - (clock() - began), MIN_TIME_LIMIT))
 
 
@@ -262,15 +259,18 @@ class PlanningContext:
         Returns:
             The failed result.
         """
+        return self._result(status, reason, self.elapsed, notes=self.notes)
+
+    def _result(self, status: Status, reason: str, planning_time: float, **more: Any) -> PlanResult:
         return PlanResult(
-            status=status,
-            reason=reason,
-            planner=self.planner_name,
-            robot=self.problem.robot.name,
-            planning_time=self.elapsed,
-            seed=self.request.seed,
-            notes=self.notes,
+            status,
+            reason,
+            self.planner_name,
+            self.problem.robot.name,
+            planning_time,
+            self.request.seed,
             refused=self._refused,
+            **more,
         )
 
     def unsolved(self, reason: str = "") -> PlanResult:
@@ -402,13 +402,10 @@ class PlanningContext:
         tolerance = path.length * 1e-3
         longer = [(at, length) for at, length in self._progress if length > path.length + tolerance]
         times = [at for at, length in self._progress if abs(length - path.length) <= tolerance]
-        return PlanResult(
-            status=Status.SOLVED,
-            reason=reason or f"solved by {stage}",
-            planner=self.planner_name,
-            robot=problem.robot.name,
-            planning_time=planning_time,
-            seed=self.request.seed,
+        return self._result(
+            Status.SOLVED,
+            reason or f"solved by {stage}",
+            planning_time,
             stage=stage,
             path=path,
             trajectory=trajectory,
@@ -416,7 +413,6 @@ class PlanningContext:
             **least_clearances(report, timed),
             notes=self.notes_with(notes),
             progress=(*longer, (times[0] if times else planning_time, path.length)),
-            refused=self._refused,
         )
 
     @property

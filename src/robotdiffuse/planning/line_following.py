@@ -101,8 +101,7 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
         """Approximate minimum duration [s] of a motion through configurations within the limits of velocity
         and acceleration."""
         first = np.gradient(rows, axis=0)
-        second = np.diff(rows, 2, axis=0)
-        second = np.concatenate([second[:1], second, second[-1:]])
+        second = np.pad(np.diff(rows, 2, axis=0), ((1, 1), (0, 0)), mode="edge")
         bounds = symmetric_bounds(limits[1], len(rows))
         grid = np.arange(float(len(rows)))
         return duration_of(grid, fastest_speeds(first, second, grid, limits[0], *bounds))
@@ -262,7 +261,7 @@ def _followed(
 
 def _obstruction(robot: Robot, q: Configuration) -> str:
     """Why a line cannot be followed beyond this configuration."""
-    limit_distance = np.where(robot.continuous, np.inf, np.minimum(q - robot.lower, robot.upper - q))
+    limit_distance = np.where(robot.continuous, np.inf, -robot.limit_excess(q))
     j = int(limit_distance.argmin())
     if limit_distance[j] < NEAR_LIMIT:
         joint = robot.planned_joints[j]

@@ -130,9 +130,10 @@ class Planner(ABC, Generic[PlannerSettings]):
         goal = problem.goal
         load_coal(robot)
         results = [call(Problem(robot, Scene(), start, goal), EASY_TIME_LIMIT)]
+        path = results[0].path
         # a ball on the straight line forces a path with corners, which needs more compiled code
-        ends = [] if results[0].path is None else [results[0].path.positions[-1]]
-        for q in [start + share * (end - start) for end in ends for share in (0.5, 0.35)]:
+        for share in () if path is None else (0.5, 0.35):
+            q = start + share * (path.positions[-1] - start)  # type: ignore[union-attr]
             ball = Sphere(robot.fk(q)[:3, 3], WARM_UP_RADIUS)
             results.append(call(Problem(robot, Scene([ball]), start, goal), EASY_TIME_LIMIT))
         last = replace(problem, waypoints=(), blend=(), moving=(), start_velocity=None)

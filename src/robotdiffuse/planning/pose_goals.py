@@ -7,7 +7,7 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.core.deadline import check_time
-from robotdiffuse.core.types import Configuration, Configurations
+from robotdiffuse.core.types import Configuration, Configurations, nearest_first
 from robotdiffuse.problems.compiled_constraints import POSE_TOLERANCE, PathConstraints
 from robotdiffuse.problems.problem import PoseGoal, PosesGoal, Problem, poses_of
 from robotdiffuse.robots.inverse_kinematics import (
@@ -92,9 +92,7 @@ def pose_configurations(
         solutions = [np.concatenate([earlier, more]) for earlier, more in zip(solutions, new, strict=True)]
         combined = new[0] if len(poses) == 1 else _combined(problem, poses, solutions, rng)
         if len(poses) > 1 or problem.constraints:
-            combined = all_constraints.projected(
-                np.concatenate([start[None], combined]), GOAL_TOLERANCE_FRACTION
-            )
+            combined = all_constraints.projected(np.vstack([start, combined]), GOAL_TOLERANCE_FRACTION)
         reached = reached or len(combined) > 0
         accepted = _accepted(robot.nearest_turns(combined, start), accept)
         before = len(configurations)
@@ -108,8 +106,7 @@ def pose_configurations(
             break
     nearer = _accepted(_pulled(all_constraints, configurations, start), accept)
     candidates = np.concatenate([nearer, configurations])
-    nearest_first = np.argsort(np.linalg.norm(candidates - start, axis=1), kind="stable")
-    return _distinct(candidates[nearest_first])[:count]
+    return _distinct(nearest_first(candidates, start))[:count]
 
 
 def at_pose(
@@ -193,5 +190,5 @@ def _distinct(q: Configurations) -> Configurations:
     unique = q[:0]
     for row in q:
         if (np.abs(unique - row).max(axis=1, initial=0.0) > MIN_DIFFERENCE).all():
-            unique = np.concatenate([unique, row[None]])
+            unique = np.vstack([unique, row])
     return unique

@@ -14,7 +14,15 @@ from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import counted
 from robotdiffuse.core.loading import loading
-from robotdiffuse.core.types import Configuration, Configurations, Mask, PlanResult, Status, Values
+from robotdiffuse.core.types import (
+    Configuration,
+    Configurations,
+    Mask,
+    PlanResult,
+    Status,
+    Values,
+    nearest_first,
+)
 from robotdiffuse.perception.depth_view import SeenPoints
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.problems.problem import (
@@ -90,7 +98,7 @@ class StartGoal:
             goals: Goal configurations [n, dof].
             constraints: Path constraints that leads keep; None: no constraints.
         """
-        robot = self._robot = checker.robot
+        robot = checker.robot
         self.checker = checker
         self._turns = robot.whole_turns(start)
         self.start = start - self._turns
@@ -129,12 +137,10 @@ class StartGoal:
             The robot and the scene for `collision.kernels.motions.motions_free`.
         """
         start, goals = self.leads()
-        states = np.concatenate([start[None], goals])
-        return self._within(padded_space(self.checker, states, resolution, clearance), states)
-
-    def _within(self, space: Space, states: Configurations) -> Space:
-        """The space with continuous joints limited to MAX_OVERTURN beyond the range of start and goals."""
-        continuous = self._robot.continuous
+        states = np.vstack([start, goals])
+        space = padded_space(self.checker, states, resolution, clearance)
+        # continuous joints are limited to MAX_OVERTURN beyond the range of start and goals
+        continuous = self.checker.robot.continuous
         lower = np.where(continuous, np.maximum(space.lower, states.min(axis=0) - MAX_OVERTURN), space.lower)
         upper = np.where(continuous, np.minimum(space.upper, states.max(axis=0) + MAX_OVERTURN), space.upper)
         return space._replace(lower=lower.astype(np.float32), upper=upper.astype(np.float32))
@@ -155,12 +161,12 @@ class StartGoal:
         assert self.start_lead is not None
         path = path.astype(np.float64)
         i = int(np.argmin([np.abs(path[-1] - lead).max() for lead in self.goal_leads]))
-        rows = [self.start[None], path[1:-1], self.goals[i][None]]
+        rows = [self.start, path[1:-1], self.goals[i]]
         if not direct and not np.array_equal(self.goal_leads[i], self.goals[i]):
-            rows.insert(2, self.goal_leads[i][None])
+            rows.insert(2, self.goal_leads[i])
         if not direct and not np.array_equal(self.start_lead, self.start):
-            rows.insert(1, self.start_lead[None])
-        return np.concatenate(rows) + self._turns if self._turns.any() else np.concatenate(rows)
+            rows.insert(1, self.start_lead)
+        return np.vstack(rows) + self._turns if self._turns.any() else np.vstack(rows)
 
 
 def padded_space(
@@ -198,17 +204,38 @@ def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
     only the meshes free are used if none has free spheres.
     Several goals are tried with little work each; only if none is free, they are tried again with more.
     """
-    checker = CollisionChecker(context.problem.robot, context.problem.scene)
-    goals = _usable_goals(context, checker)
+    robot = context.problem.robot
+    scene = context.problem.scene
+    start = context.problem.start
+    checker = CollisionChecker(robot, scene)
+    if not checker.free(start[None])[0]:
+        collision = _explained(robot, scene, start)
+        if collision is not None:
+            note = arm_in_cloud_note(robot, scene, start)
+            if note:
+                context.note(note)
+            return context.fail(Status.INVALID_START, f"the start is in collision: {collision}")
+    constraints = context.validator.constraints
+    wrong = None if constraints is None else constraints.worst_violation(start)
+    if wrong is not None:
+        return context.fail(Status.INVALID_START, f"the start does not keep the constraints: {wrong.message}")
+    heavy = _too_heavy(context, start)
+    if heavy is not None:
+        return context.fail(Status.INVALID_START, f"the payload cannot be held at the start: {heavy}")
+    goals = _goals(context, context.problem.goal, checker)
     if isinstance(goals, PlanResult):
         return goals
-    start_goal = StartGoal(checker, context.problem.start, goals, context.validator.constraints)
+    holdable = _holdable(context, goals)
+    if not len(holdable):
+        reason = f"the payload cannot be held at the goal: {_too_heavy(context, goals[0])}"
+        return context.fail(Status.INVALID_GOAL, reason)
+    start_goal = StartGoal(checker, start, holdable, constraints)
     if start_goal.start_lead is None:
-        why = closeness(checker, context.problem.start)
+        why = closeness(checker, start)
         return context.fail(Status.INVALID_START, f"the start is too close to contact to plan from: {why}")
     if not start_goal.goals:
-        why = closeness(checker, goals[0])
-        reason = f"{_all_goals(goals, 'is', 'are')} too close to contact to plan to: {why}"
+        why = closeness(checker, holdable[0])
+        reason = f"{_all_goals(holdable, 'is', 'are')} too close to contact to plan to: {why}"
         return context.fail(Status.INVALID_GOAL, reason)
     return start_goal
 
@@ -249,34 +276,6 @@ def closeness(checker: CollisionChecker, q: Configuration) -> str:
         f"the covering spheres of {link} reach {-1e3 * float(clearances[deepest]):.1f} mm into {hit}, "
         f"though the meshes are {1e3 * float(distance):.1f} mm apart"
     )
-
-
-def _usable_goals(context: PlanningContext, checker: CollisionChecker) -> Configurations | PlanResult:
-    robot = context.problem.robot
-    scene = context.problem.scene
-    start = context.problem.start
-    if not checker.free(start[None])[0]:
-        collision = _explained(robot, scene, start)
-        if collision is not None:
-            note = arm_in_cloud_note(robot, scene, start)
-            if note:
-                context.note(note)
-            return context.fail(Status.INVALID_START, f"the start is in collision: {collision}")
-    constraints = context.validator.constraints
-    wrong = None if constraints is None else constraints.worst_violation(start)
-    if wrong is not None:
-        return context.fail(Status.INVALID_START, f"the start does not keep the constraints: {wrong.message}")
-    heavy = _too_heavy(context, start)
-    if heavy is not None:
-        return context.fail(Status.INVALID_START, f"the payload cannot be held at the start: {heavy}")
-    goals = _goals(context, context.problem.goal, checker)
-    if isinstance(goals, PlanResult):
-        return goals
-    holdable = _holdable(context, goals)
-    if not len(holdable):
-        reason = f"the payload cannot be held at the goal: {_too_heavy(context, goals[0])}"
-        return context.fail(Status.INVALID_GOAL, reason)
-    return holdable
 
 
 def _holdable(context: PlanningContext, goals: Configurations) -> Configurations:
@@ -431,7 +430,7 @@ def _pose_goals(
     # Exact meshes may be free where the covering spheres collide. Distinct rejected configurations are
     # checked, nearest to the start first, if they are nearer to it than the nearest free one.
     rejected = rejected[np.unique(np.round(rejected, 1), axis=0, return_index=True)[1]]
-    rejected = rejected[np.argsort(distances(rejected), kind="stable")][:MAX_EXACT_GOALS]
+    rejected = nearest_first(rejected, start)[:MAX_EXACT_GOALS]
     if len(configurations):
         rejected = rejected[distances(rejected) < distances(configurations[:1])]
     if len(rejected):

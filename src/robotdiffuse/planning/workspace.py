@@ -3,7 +3,7 @@ steps such as approach, grasp, lift, carry and place, planned in one call."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from robotdiffuse.core.errors import (
 )
 from robotdiffuse.core.transforms import inverse, rpy_from_rotation
 from robotdiffuse.core.transforms import pose as pose_matrix
-from robotdiffuse.core.types import AnyConfiguration, Configuration, PlanResult, Trajectory
+from robotdiffuse.core.types import AnyConfiguration, Configuration, PlanResult, Trajectory, frozen_dataclass
 from robotdiffuse.planning import plan
 from robotdiffuse.planning.context import PlanRequest, clock, time_left
 from robotdiffuse.planning.pipeline.waypoints import join, one_after_another
@@ -64,7 +64,7 @@ def _kept(value: Any) -> Any:
     return value if array is None else array
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class MoveTo:
     """A step of `Workspace.plan_steps`: move around the obstacles to a goal."""
 
@@ -86,7 +86,7 @@ class MoveTo:
             object.__setattr__(self, name, _kept(getattr(self, name)))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class MoveRelative:
     """A step of `Workspace.plan_steps`: move the tip along a straight line and keep its orientation."""
 
@@ -111,7 +111,7 @@ class MoveRelative:
         object.__setattr__(self, "contacts", _kept(self.contacts))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Attach:
     """A step of `Workspace.plan_steps`: the robot takes an obstacle."""
 
@@ -128,7 +128,7 @@ class Attach:
         object.__setattr__(self, "touch_links", _kept(self.touch_links))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Detach:
     """A step of `Workspace.plan_steps`: the robot releases a held object, which then is an obstacle."""
 
@@ -141,7 +141,7 @@ class Detach:
 Step = MoveTo | MoveRelative | Attach | Detach
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class StepsResult:
     """The answer of `Workspace.plan_steps`."""
 
@@ -208,106 +208,6 @@ class StepsResult:
         raise InputError(f"no motion was planned for a step {shown(name)}; MoveTo steps: {names or 'none'}")
 
 
-def plan_steps(
-    space: Any, steps: Sequence[Step], start: AnyConfiguration, time_limit: float, **request: Any
-) -> StepsResult:
-    """See `Workspace.plan_steps`. The search is depth-first: if a step fails, the last `MoveTo` step before
-    it that has another end is planned again to that end."""
-    began = clock()
-    check_type("steps", steps, (list, tuple), "a list of steps")
-    for i, step in enumerate(steps):
-        check_type(f"steps[{i}]", step, Step.__args__, "rd.MoveTo, MoveRelative, Attach or Detach")
-        if isinstance(step, MoveTo | MoveRelative):
-            check_type(f"steps[{i}].contacts", step.contacts, Mapping, "a mapping of obstacles to links")
-    if "constraints" in request:
-        raise InputError("constraints are those of one step; give them to rd.MoveTo")
-    PlanRequest(time_limit)  # raises InputError for a wrong limit, before the limit is divided
-    furthest = StepsResult((), (), space, "", 0.0)
-    tried_ends = 0
-
-    def motions(k: int, space: Any, q: Configuration) -> Iterator[PlanResult]:
-        """Motions of step k from q, each to another goal or goal configuration. If the first one fails, the
-        failed result is the only one; if a later one fails, there are no more."""
-        step = steps[k]
-        assert isinstance(step, MoveTo | MoveRelative)
-        space = copy(space)
-        space.scene = Scene(space.scene.shapes, [*space.scene.allowed_contacts, *step.contacts.items()])
-        seconds_left = time_left(time_limit, began)
-        seconds_left /= sum(isinstance(later, MoveTo | MoveRelative) for later in steps[k:])
-        if isinstance(step, MoveRelative):
-            T = space.pose(q)
-            end = pose_matrix(step.xyz) @ T if step.frame == WORLD else T @ pose_matrix(step.xyz)
-            if any(isinstance(earlier, MoveTo) for earlier in steps[:k]):
-                seconds_left = min(seconds_left, LINE_TIME_LIMIT)
-            yield space.plan_line(end, q, step.tolerance, time_limit=seconds_left, **request)
-            return
-        space.tip = space.tip if step.link is None else step.link
-        space.robot.link_frame(space.tip)  # raises InputError for an unknown link
-        options = {"constraints": step.constraints, "time_limit": seconds_left, **request}
-        result = space.plan(step.goal, q, **options)
-        yield result
-        if result.solved:
-            ends = _goal_ends(result.problem)
-            indices = [result.goal_index]
-        while result.solved:
-            gaps = np.array([end for _, end in ends]).reshape(-1, space.robot.dof) - result.path.positions[-1]
-            gaps -= space.robot.whole_turns(gaps)
-            ends = [end for end, gap in zip(ends, gaps, strict=True) if np.abs(gap).max() > SAME_END]
-            # ends at goals that no earlier motion reached come first
-            untried = [(i, end) for i, end in ends if i not in indices] or ends
-            if not untried:
-                return
-            result = space.plan(JointGoal(np.array([end for _, end in untried])), q, **options)
-            if result.solved:
-                index = untried[result.goal_index or 0][0]
-                indices.append(index)
-                yield replace(result, goal_index=index)
-
-    def where(k: int) -> str:
-        return f"step {k + 1} of {len(steps)}, {steps[k].name}"
-
-    # The planned motions: number of the step, the workspace and the results before it, and its alternatives.
-    # This is a list, since a recursion with one call per step has a limit.
-    planned = list[tuple[int, Any, tuple[PlanResult | None, ...], Iterator[PlanResult]]]()
-    results: tuple[PlanResult | None, ...] = ()
-    q = checked_configuration(space.robot, "start", start, [])
-    k = 0
-    while k < len(steps):
-        step = steps[k]
-        if isinstance(step, Attach | Detach):
-            space = copy(space)
-            with located(where(k)):
-                if isinstance(step, Attach):
-                    space.attach(step.obstacle, q, step.link, step.touch_links)
-                else:
-                    space.detach(step.held, q)
-            results = (*results, None)
-            k += 1
-            continue
-        planned.append((k, space, results, motions(k, space, q)))
-        over = False
-        while True:
-            k, space, results, alternatives = planned[-1]
-            with located(where(k)):
-                result = None if over else next(alternatives, None)
-            if result is not None and result.solved:
-                break
-            if result is not None and len(results) >= len(furthest.results):
-                reason = f"{where(k)}: {result.reason}"
-                furthest = StepsResult(tuple(steps), (*results, result), space, reason, 0.0)
-            planned.pop()
-            if not planned:
-                attempts_text = f"; {tried_ends} ends of earlier steps were tried" if tried_ends > 1 else ""
-                reason = furthest.reason + attempts_text
-                return replace(furthest, reason=reason, planning_time=clock() - began)
-            tried_ends += isinstance(steps[planned[-1][0]], MoveTo)
-            over = clock() - began > time_limit
-        results = (*results, result)
-        q = result.path.positions[-1]
-        k += 1
-    return StepsResult(tuple(steps), results, space, f"solved in {counted(k, 'step')}", clock() - began)
-
-
 def _goal_ends(problem: Problem) -> list[tuple[int, Configuration]]:
     """Configurations at the goals of a problem, each with its goal index (see `PlanResult.goal_index`); none
     for poses with tolerances and for poses of several links."""
@@ -354,7 +254,6 @@ class Workspace:
         """The robot with its held objects."""
         self.tip = robot.tip if tip is None else tip
         robot.link_frame(self.tip)
-        self._T_world_base = np.eye(4)
         self.scene = Scene()
         """The obstacles, in the frame of the base."""
         self.T_world_base = np.eye(4) if T_world_base is None else T_world_base  # type: ignore[assignment]
@@ -566,6 +465,7 @@ class Workspace:
             InputError: For what `rd.Problem` or `rd.plan` does not accept.
         """
         began = clock()
+        PlanRequest(time_limit)  # raises InputError for a wrong limit, before it is used
         problem = self._problem(start, self._goal(goal), constraints)
         return plan(problem, time_left(time_limit, began), **request)
 
@@ -597,7 +497,103 @@ class Workspace:
             >>> space.plan_steps(steps, "ready").solved
             True
         """
-        return plan_steps(self, steps, start, time_limit, **request)
+        # The search is depth-first: if a step fails, the last `MoveTo` step before it that has another end is
+        # planned again to that end.
+        began = clock()
+        space = self
+        check_type("steps", steps, (list, tuple), "a list of steps")
+        for i, step in enumerate(steps):
+            check_type(f"steps[{i}]", step, Step.__args__, "rd.MoveTo, MoveRelative, Attach or Detach")
+            if isinstance(step, MoveTo | MoveRelative):
+                check_type(f"steps[{i}].contacts", step.contacts, Mapping, "a mapping of obstacles to links")
+        if "constraints" in request:
+            raise InputError("constraints are those of one step; give them to rd.MoveTo")
+        PlanRequest(time_limit)  # raises InputError for a wrong limit, before the limit is divided
+        furthest = StepsResult((), (), space, "", 0.0)
+        tried_ends = 0
+
+        def motions(k: int, space: Any, q: Configuration) -> Iterator[PlanResult]:
+            """Motions of step k from q, each to another goal or goal configuration. If the first one fails,
+            the failed result is the only one; if a later one fails, there are no more."""
+            step = steps[k]
+            assert isinstance(step, MoveTo | MoveRelative)
+            space = copy(space)
+            space.scene = Scene(space.scene.shapes, [*space.scene.allowed_contacts, *step.contacts.items()])
+            seconds_left = time_left(time_limit, began)
+            seconds_left /= sum(isinstance(later, MoveTo | MoveRelative) for later in steps[k:])
+            if isinstance(step, MoveRelative):
+                T = space.pose(q)
+                end = pose_matrix(step.xyz) @ T if step.frame == WORLD else T @ pose_matrix(step.xyz)
+                if any(isinstance(earlier, MoveTo) for earlier in steps[:k]):
+                    seconds_left = min(seconds_left, LINE_TIME_LIMIT)
+                yield space.plan_line(end, q, step.tolerance, time_limit=seconds_left, **request)
+                return
+            space.tip = space.tip if step.link is None else step.link
+            space.robot.link_frame(space.tip)  # raises InputError for an unknown link
+            options = {"constraints": step.constraints, "time_limit": seconds_left, **request}
+            result = space.plan(step.goal, q, **options)
+            yield result
+            if result.solved:
+                ends = _goal_ends(result.problem)
+                indices = [result.goal_index]
+            while result.solved:
+                gaps = np.array([end for _, end in ends]).reshape(-1, space.robot.dof)
+                gaps -= result.path.positions[-1]
+                gaps -= space.robot.whole_turns(gaps)
+                ends = [end for end, gap in zip(ends, gaps, strict=True) if np.abs(gap).max() > SAME_END]
+                # ends at goals that no earlier motion reached come first
+                untried = [(i, end) for i, end in ends if i not in indices] or ends
+                if not untried:
+                    return
+                result = space.plan(JointGoal(np.array([end for _, end in untried])), q, **options)
+                if result.solved:
+                    index = untried[result.goal_index or 0][0]
+                    indices.append(index)
+                    yield replace(result, goal_index=index)
+
+        def where(k: int) -> str:
+            return f"step {k + 1} of {len(steps)}, {steps[k].name}"
+
+        # The planned motions: number of the step, the workspace and the results before it, and its
+        # alternatives. This is a list, since a recursion with one call per step has a limit.
+        planned = list[tuple[int, Any, tuple[PlanResult | None, ...], Iterator[PlanResult]]]()
+        results: tuple[PlanResult | None, ...] = ()
+        q = checked_configuration(space.robot, "start", start, [])
+        k = 0
+        while k < len(steps):
+            step = steps[k]
+            if isinstance(step, Attach | Detach):
+                space = copy(space)
+                with located(where(k)):
+                    if isinstance(step, Attach):
+                        space.attach(step.obstacle, q, step.link, step.touch_links)
+                    else:
+                        space.detach(step.held, q)
+                results = (*results, None)
+                k += 1
+                continue
+            planned.append((k, space, results, motions(k, space, q)))
+            over = False
+            while True:
+                k, space, results, alternatives = planned[-1]
+                with located(where(k)):
+                    result = None if over else next(alternatives, None)
+                if result is not None and result.solved:
+                    break
+                if result is not None and len(results) >= len(furthest.results):
+                    reason = f"{where(k)}: {result.reason}"
+                    furthest = StepsResult(tuple(steps), (*results, result), space, reason, 0.0)
+                planned.pop()
+                if not planned:
+                    tried = f"; {tried_ends} ends of earlier steps were tried" if tried_ends > 1 else ""
+                    reason = furthest.reason + tried
+                    return replace(furthest, reason=reason, planning_time=clock() - began)
+                tried_ends += isinstance(steps[planned[-1][0]], MoveTo)
+                over = clock() - began > time_limit
+            results = (*results, result)
+            q = result.path.positions[-1]
+            k += 1
+        return StepsResult(tuple(steps), results, space, f"solved in {counted(k, 'step')}", clock() - began)
 
     def plan_line(
         self,
@@ -657,6 +653,7 @@ class Workspace:
                 q = result.path.positions[-1]
                 lines.append(result)
             joined = join(lines, time_limit=time_left(time_limit, began))
+            joined = replace(joined, seed=lines[-1].seed)
             return replace(joined, fraction=1.0, goal_index=lines[-1].goal_index) if joined.solved else joined
         several = isinstance(pose, AnyGoal)
         matrices = numbers(pose)
@@ -665,9 +662,7 @@ class Workspace:
                 f"pose is {len(pose)} poses; a line has one end: give all poses but the last as waypoints, "
                 "or give an rd.AnyGoal to reach any one pose"
             )
-        goals = pose.goals if several else [pose]
-        if not isinstance(pose, Goal):
-            goals = [self._goal(rigid_transform("pose", pose))]
+        goals = goals_of(pose) if isinstance(pose, Goal) else [self._goal(rigid_transform("pose", pose))]
         q = self._configuration(start)
         goals = [self._exact(goal, q) if isinstance(goal, PoseGoal) else goal for goal in goals]
         problems = [self._problem(start, goal, [line]) for goal in goals]
@@ -692,8 +687,8 @@ class Workspace:
         """A goal without tolerances: the pose within the tolerances of `goal` that is near to the pose of its
         link at q. Each coordinate of the link's pose is clipped to its tolerance."""
         T = inverse(goal.T_base_frame) @ self.robot.fk(q, goal.frame)
-        xyz_tolerance = np.zeros(3) if goal.xyz_tolerance is None else goal.xyz_tolerance
-        rpy_tolerance = np.zeros(3) if goal.rpy_tolerance is None else goal.rpy_tolerance
+        given = goal.xyz_tolerance, goal.rpy_tolerance
+        xyz_tolerance, rpy_tolerance = (0.0 if most is None else most for most in given)
         xyz = np.clip(T[:3, 3], -xyz_tolerance, xyz_tolerance)
         rpy = np.clip(rpy_from_rotation(T[:3, :3]), -rpy_tolerance, rpy_tolerance)
         return PoseGoal(goal.frame, goal.T_base_frame @ pose_matrix(xyz, rpy=rpy))
@@ -719,8 +714,7 @@ class Workspace:
 
     def _problem_at_rest(self) -> Problem:
         """A problem that is used for its scene only; its start and goal are placeholders."""
-        middle = 0.5 * (self.robot.lower + self.robot.upper)
-        return self._problem(middle, middle)
+        return self._problem(self.robot.middle, self.robot.middle)
 
     def _obstacle(self, name: str) -> Shape:
         obstacles = {shape.name: shape for shape in self.scene.shapes}

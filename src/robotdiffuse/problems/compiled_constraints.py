@@ -26,6 +26,7 @@ from robotdiffuse.core.types import (
     Rotation,
     Values,
     Vector,
+    arc_lengths,
     for_kernels,
     interpolated,
 )
@@ -228,8 +229,8 @@ class PathConstraints:
         """The maximum value of a row from a place on the motion until the row is satisfied again."""
         following = min(segment + 1, len(q) - 1)
         at = q[segment] + fraction * (q[following] - q[segment])
-        remaining = np.concatenate([at[None], q[following:]])
-        knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(remaining, axis=0), axis=1))])
+        remaining = np.vstack([at, q[following:]])
+        knots = arc_lengths(remaining)
         near = np.geomspace(MIN_SEGMENT_FRACTION, VIOLATION_STEP, 64)
         s = np.unique(np.concatenate([near, VIOLATION_STEP * np.arange(VIOLATION_STEPS), knots]))
         s = s[s <= min(knots[-1], VIOLATION_STEP * VIOLATION_STEPS)]
@@ -337,8 +338,7 @@ def rotation_vector(rotation: Rotation) -> Vector:
         return np.zeros(3)
     # R + R^T has the axis as the eigenvector of its largest eigenvalue; R - R^T gives the sign
     axis = np.linalg.eigh(rotation + rotation.T)[1][:, -1]
-    skew = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0]])
-    skew = np.append(skew, rotation[1, 0] - rotation[0, 1])
+    skew = rotation[[2, 0, 1], [1, 2, 0]] - rotation[[1, 2, 0], [2, 0, 1]]
     return angle * axis * (-1.0 if skew @ axis < 0 else 1.0)
 
 

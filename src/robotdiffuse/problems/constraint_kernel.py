@@ -258,11 +258,12 @@ def _roll_pitch_yaw(rows, m, T, angles):
 def row_value(rows, m, work):
     """The value of row m at the pose in work.T [m] or [rad]. For an angular row, writes the error to
     work.error."""
-    if rows.row_kind[m] == CONE:
+    kind = rows.row_kind[m]
+    if kind == CONE:
         return _cone(rows, m, work.T, work.error)
-    if rows.row_kind[m] == TURN:
+    if kind == TURN:
         return _turn(rows, m, work.T, work.target, work.error)
-    if rows.row_kind[m] == ROLL_PITCH_YAW:
+    if kind == ROLL_PITCH_YAW:
         return _roll_pitch_yaw(rows, m, work.T, work.error)
     outside = 0.0
     deepest = -np.inf

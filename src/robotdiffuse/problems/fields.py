@@ -106,7 +106,8 @@ POSE = {
     "rpy": _array(NUMBER, 3) | {"description": "roll, pitch, yaw [rad], as in URDFs"},
 }
 TOLERANCES = ("xyz_tolerance", "rpy_tolerance")
-GOAL_POSE = {"frame": TEXT, "relative_to": TEXT, **POSE, **dict.fromkeys(TOLERANCES, NUMBERS)}
+LINK_POSE = {"relative_to": TEXT, **POSE, **dict.fromkeys(TOLERANCES, NUMBERS)}
+GOAL_POSE = {"frame": TEXT, **LINK_POSE}
 GOALS = {
     "joints": {"oneOf": [NUMBERS, TEXT]},
     "joint_set": ROWS,
@@ -290,9 +291,7 @@ def read_goal(where: str, data: object, setting: Setting) -> Goal:
 
 def _pose_goal(where: str, value: object, scene: Scene, frame: object = None) -> PoseGoal:
     """The goal of a pose entry. frame: the link; None: the entry names it."""
-    pose_fields = (
-        GOAL_POSE if frame is None else {name: GOAL_POSE[name] for name in GOAL_POSE if name != "frame"}
-    )
+    pose_fields = GOAL_POSE if frame is None else LINK_POSE
     required = [name for name in ("frame", "xyz", "wxyz") if name in pose_fields]
     pose = {"frame": frame, **check_fields(where, value, required, pose_fields)}
     T = pose_of(where, pose)
@@ -396,7 +395,9 @@ class Field(NamedTuple):
     schema: Schema
     read: Callable[[Any, Setting], Any] = lambda data, setting: data
     """Converts the plain data of a file to the argument for `Problem`."""
-    write: Callable[[Any, Path | None], Any] = lambda value, folder: value
+    write: Callable[[Any, Path | None], Any] = lambda value, folder: (
+        value.tolist() if isinstance(value, np.ndarray) else value
+    )
     """Converts the field's value to plain data; names of files are relative to the folder."""
     in_world: bool = False
     """Whether files give the value in the frame of the world."""
@@ -415,7 +416,6 @@ FIELDS = {
             "oneOf": [NUMBERS, TEXT, OBJECT | {"additionalProperties": NUMBER}],
             "description": "joint values [rad or m], as a list or by joint, or a named pose",
         },
-        write=lambda value, folder: value.tolist(),
         with_request=False,
     ),
     "goal": Field(
@@ -464,7 +464,7 @@ FIELDS = {
         in_world=True,
         with_request=False,
     ),
-    "start_velocity": Field(NUMBERS, write=lambda value, folder: value.tolist(), with_request=False),
+    "start_velocity": Field(NUMBERS, with_request=False),
     "payload": Field(
         _object(PAYLOAD_FIELDS, "mass"),
         lambda data, setting: Payload(**check_fields("payload", data, ("mass",), PAYLOAD_FIELDS)),
@@ -510,6 +510,6 @@ def problem_schema() -> Schema:
         "$defs": {
             "shape": _one_of(shapes),
             "goal": goal,
-            "pose": _object({name: field for name, field in GOAL_POSE.items() if name != "frame"}),
+            "pose": _object(LINK_POSE),
         },
     }

@@ -11,7 +11,7 @@ store whether each problem is trivial, and the length of its shortest known path
 import itertools
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from numbers import Integral
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from robotdiffuse.core.files import (
 )
 from robotdiffuse.core.settings import Number, converted
 from robotdiffuse.core.transforms import pose_entry
-from robotdiffuse.core.types import Configuration
+from robotdiffuse.core.types import Configuration, frozen_dataclass
 from robotdiffuse.core.types import Path as Waypoints
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.fields import (
@@ -65,7 +65,7 @@ from robotdiffuse.scenes.files import check_fields, read_scene
 from robotdiffuse.scenes.scene import Scene
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class ProblemEntry:
     """One of many problems: the problem, or the reason why it cannot be used."""
 
@@ -121,25 +121,24 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
     return _problem(str(file), data, file.parent, ignore_joints=ignore_joints)
 
 
-def load_problems(file: str | Path, ignore_joints: bool = False) -> list[ProblemEntry]:
+def load_problems(file: str | Path) -> list[ProblemEntry]:
     """All problems of a .jsonl file or a MotionBenchMaker folder, or the one problem of another file.
 
     In a .jsonl file, each line is a problem as in `load_problem`, named after the file and its line number;
-    the first wrong line raises InputError with its number. For folders see `load_motion_bench_maker`;
-    `ignore_joints` as in `load_problem`.
+    the first wrong line raises InputError with its number. For folders see `load_motion_bench_maker`.
     """
     file = file_name(file, "problem file")
     if file.is_dir():
-        return load_motion_bench_maker(file, ignore_joints=ignore_joints)
+        return load_motion_bench_maker(file)
     if file.suffix.lower() != ".jsonl":
-        return [ProblemEntry(file.stem, load_problem(file, ignore_joints=ignore_joints))]
+        return [ProblemEntry(file.stem, load_problem(file))]
     return [
-        ProblemEntry(f"{file.stem}:{number}", _problem_of_line(file, number, line, ignore_joints))
+        ProblemEntry(f"{file.stem}:{number}", _problem_of_line(file, number, line))
         for number, line in _lines(read_text(file))
     ]
 
 
-def _problem_of_line(file: Path, number: int, line: str, ignore_joints: bool) -> Problem:
+def _problem_of_line(file: Path, number: int, line: str, ignore_joints: bool = False) -> Problem:
     location = f"{file}, line {number}"
     return _problem(location, parse_json(line, location), file.parent, ignore_joints=ignore_joints)
 
@@ -180,7 +179,7 @@ def problem_record(
     folder = None if folder is None else Path(folder)
     T = problem.T_world_base
     scene = problem.known_scene
-    record: dict[str, object] = {"robot": str(robot), "locked": problem.robot.locked}
+    record: dict[str, object] = {"robot": str(robot), "locked": dict(problem.robot.locked)}
     if T is not None:
         record["base"] = rounded(pose_entry(T))
     record |= equipment_entries(problem.robot, folder)
@@ -222,11 +221,10 @@ def save_problem(problem: Problem, file: str | Path, robot: str | None = None) -
 
 
 class _Dumper(yaml.CSafeDumper):
-    """Also writes NumPy's texts, such as names from an array, and read-only dictionaries."""
+    """Also writes NumPy's texts, such as names from an array."""
 
 
 _Dumper.add_multi_representer(str, lambda dumper, text: dumper.represent_str(str(text)))
-_Dumper.add_multi_representer(dict, yaml.CSafeDumper.represent_dict)
 
 
 def _yaml(data: dict[str, object]) -> str:
@@ -376,7 +374,7 @@ def _problem(
         return Problem.in_world(base, robot, scene, notes=tuple(notes), **options)
 
 
-def _robot(name: object, locked: object, folder: Path, robots: Mapping[str, Robot] | None = None) -> Robot:
+def _robot(name: object, locked: object, folder: Path, robots: Mapping[str, Robot] | None) -> Robot:
     if robots is not None:
         check_name("robot", name, robots)
     if not isinstance(name, str) or not name:
@@ -409,7 +407,7 @@ def goal_of(problem: Problem) -> Configuration:
     return problem.goal.positions[0]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Case:
     """A problem of an evaluation, with what is known about its solutions."""
 

@@ -6,7 +6,6 @@ Vectors may be lists or mappings (x, y, z), and quaternions are xyzw.
 """
 
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +34,7 @@ from robotdiffuse.core.transforms import (
     rotation_z_to,
     transform,
 )
-from robotdiffuse.core.types import Pose, Vector
+from robotdiffuse.core.types import Pose, Vector, frozen_dataclass
 from robotdiffuse.robots.bodies import AttachedBody, polygon_around_circle
 from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
 from robotdiffuse.scenes.files import check_fields
@@ -337,7 +336,7 @@ def object_shapes(entry: JsonObject, frames: MoveItFrames, folder: Path) -> list
             if key == "plane":
                 shapes.append(_plane(vector(location, "coef", part.get("coef"), 4), name).moved(T))
                 continue
-            placed = T[:3, 3], quaternion_from_rotation(T[:3, :3]), name
+            placed = T[:3, 3], quaternion_from_rotation(T), name
             if key == "mesh":
                 shapes.append(Mesh(*_triangles(location, part, folder), *placed[:2], name=name))
                 continue
@@ -459,7 +458,7 @@ def joint_notes(
     )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class MoveItAttached:
     """An object that the robot holds at the start."""
 
@@ -483,7 +482,7 @@ class MoveItAttached:
         return robot.with_body(AttachedBody(self.name, self.link, T_link_body, shapes, touch))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class MoveItRequest:
     """The content of a motion plan request. Either `joint_goals` is not empty or `pose_goal` is not None."""
 

@@ -559,22 +559,23 @@ class Problem(Value):
     def __post_init__(self) -> None:
         if self.unknown is not None:
             check_unknown("unknown", self.unknown)
-        check_robot(self.robot)
+        robot = self.robot
+        check_robot(robot)
         check_type("scene", self.scene, Scene, "a Scene, e.g. rd.Scene([shape, ...])")
-        check_contacts(self.robot, self.scene)
+        check_contacts(robot, self.scene)
         check_list("notes", self.notes, str, "texts")
         notes = list(self.notes)
         T = self.T_world_base
         checked: dict[str, Any] = {
             "clearance": None if self.clearance is None else check_clearance(self.clearance),
-            "start": checked_configuration(self.robot, "start", self.start, notes),
-            "goal": checked_goal(self.robot, "goal", self.goal, notes),
-            "waypoints": waypoint_goals(self.robot, self.waypoints, notes),
-            "payload": checked_payload(self.robot, self.payload),
-            "constraints": path_constraints(self.robot, self.constraints),
-            "views": depth_views(self.robot, self.views),
+            "start": checked_configuration(robot, "start", self.start, notes),
+            "goal": checked_goal(robot, "goal", self.goal, notes),
+            "waypoints": waypoint_goals(robot, self.waypoints, notes),
+            "payload": checked_payload(robot, self.payload),
+            "constraints": path_constraints(robot, self.constraints),
+            "views": depth_views(robot, self.views),
             "moving": moving_obstacles(self.moving, self.scene),
-            "start_velocity": velocity_at_start(self.robot, self.start_velocity, notes),
+            "start_velocity": velocity_at_start(robot, self.start_velocity, notes),
             "T_world_base": T if T is None else rigid_transform("T_world_base", T),
             "notes": tuple(notes),
         }
@@ -588,7 +589,7 @@ class Problem(Value):
                 goal.positions for goal in goals_of(checked["goal"]) if isinstance(goal, JointGoal)
             ]
             goals = np.concatenate(joint_goals or [checked["start"][None]])
-            seen = seen_shapes(checked["views"], self.robot, known_scene, checked["start"], goals)
+            seen = seen_shapes(checked["views"], robot, known_scene, checked["start"], goals)
             checked["scene"] = added(known_scene, seen)
         for name, value in checked.items():
             object.__setattr__(self, name, value)

@@ -59,27 +59,28 @@ def _residuals(rows, limits, q, work):
     count = 0
     dof = len(q)
     for m in range(len(rows.row_kind)):
+        kind = rows.row_kind[m]
         if not rows.same_frame[m]:
             pose_frame(rows, m, q, work)
         value = row_value(rows, m, work)
         if value <= limits[m]:
             continue
-        residuals = 1 if rows.row_kind[m] == CONE else 3
+        residuals = 1 if kind == CONE else 3
         # the fraction of the error to remove, so that inner_limit is left
         share = 1.0 - rows.inner_limit[m] / value if value > 0 else 1.0
         sine = length(work.error)  # of a CONE's angle
         for r in range(residuals):
-            if rows.row_kind[m] == DISTANCE:
+            inner = rows.inner_half_size[m, r]
+            if kind == DISTANCE:
                 x = box_coordinate(rows, m, work.T, r)
-                offset = min(max(x, -rows.inner_half_size[m, r]), rows.inner_half_size[m, r]) - x
+                offset = min(max(x, -inner), inner) - x
                 if offset == 0.0:
                     continue
                 work.e[count] = offset * share
-            elif rows.row_kind[m] == CONE:
+            elif kind == CONE:
                 work.e[count] = ANGLE_WEIGHT * (value - rows.inner_limit[m])
-            elif rows.row_kind[m] == ROLL_PITCH_YAW:
+            elif kind == ROLL_PITCH_YAW:
                 angle = work.error[r]
-                inner = rows.inner_half_size[m, r]
                 if abs(angle) <= rows.half_size[m, r]:
                     continue
                 work.e[count] = ANGLE_WEIGHT * (min(max(angle, -inner), inner) - angle)
@@ -90,15 +91,15 @@ def _residuals(rows, limits, q, work):
                 work.J[count, j] = 0.0
             for k in range(rows.chain_length[m]):
                 entry = 0.0
-                if rows.row_kind[m] == DISTANCE:
+                if kind == DISTANCE:
                     frame_velocity(rows, m, k, work, work.y)
                     for i in range(3):
                         entry += rows.reference_pose[m, i, r] * work.y[i]
                 elif rows.joint_kinds[m, k] == PRISMATIC:
                     pass  # it does not turn the frame
-                elif rows.row_kind[m] == TURN:
+                elif kind == TURN:
                     entry = ANGLE_WEIGHT * work.axes[k, r]
-                elif rows.row_kind[m] == ROLL_PITCH_YAW:
+                elif kind == ROLL_PITCH_YAW:
                     entry = ANGLE_WEIGHT * _angle_rate(rows.reference_pose[m], work.axes[k], work.error, r)
                 elif sine > 1e-9:
                     for i in range(3):

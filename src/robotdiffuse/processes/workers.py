@@ -34,6 +34,8 @@ from robotdiffuse.core.errors import InputError, needs
 from robotdiffuse.core.interrupts import delay_interrupts
 from robotdiffuse.core.registry import AddedEntries, added_entries, adopt_entries
 
+Function = Callable[..., Any]
+"""A function that other processes can import: of a module, or a method of an object that can be pickled."""
 Results = Generator[tuple[int, Any], None, None]
 """Results in order of completion, each with the index of its call. After it is closed, the generator submits
 no more calls. Calls that run are stopped with their processes or with the cluster that was connected for
@@ -109,7 +111,7 @@ class Worker:
     busy = False
     """Whether `Workers` runs a call in it."""
 
-    def __init__(self, prepare: Callable[..., object] = _nothing, arguments: tuple = ()) -> None:
+    def __init__(self, prepare: Function = _nothing, arguments: tuple = ()) -> None:
         """`prepare(*arguments)` runs once in each new process. If it returns True, a second process replaces
         this one, for example to load the code that the first has compiled."""
         self._prepare = prepare
@@ -129,9 +131,9 @@ class Worker:
         Raises NotStartedError if it cannot start, EndedError if it ends while it prepares or is closed.
         """
         if self._running is not None and not self._running[0].is_alive():  # killed between two calls
-            self.end(0.0)
+            self.end()
         if self._running is None and self._start() is True:
-            self.end(0.0)
+            self.end()
             self._start()
 
     def _start(self) -> object:
@@ -152,7 +154,7 @@ class Worker:
         try:
             connection.recv()  # the process has started; only now can it take a call
         except (EOFError, OSError):
-            self.end(0.0)
+            self.end()
             raise EndedError("closed") if self._closed else _not_started() from None
         result = self._ask(pickle.dumps((added_entries(), self._prepare, self._arguments)), PREPARE_TIMEOUT)
         self.ready = True
@@ -160,7 +162,7 @@ class Worker:
 
     def call(
         self,
-        call: Callable[..., Any],
+        call: Function,
         *arguments: Any,
         timeout: float = inf,
         stop: Callable[[], bool] = lambda: False,
@@ -190,7 +192,7 @@ class Worker:
             while True:
                 remaining = due - time.monotonic()
                 if remaining <= 0:
-                    self.end(0.0)
+                    self.end()
                     raise OverrunError("because its call took too long")
                 if not stop_sent and stop():
                     stop_sent = True
@@ -206,28 +208,27 @@ class Worker:
                         due = time.monotonic() + answer
         except (EOFError, OSError):
             process.join(TERMINATE_TIMEOUT)
-            self.end(0.0)
+            self.end()
             code = process.exitcode or 0
             names = {number.value: number.name for number in signal.Signals}
             killed_by = names.get(-code, f"signal {-code}")  # most real-time signals have no name
             exit_text = f"by {killed_by}" if code < 0 else f"with exit status {code}"
             raise EndedError("closed" if self._closed else exit_text) from None
         if renew:
-            self.end(0.0)
+            self.end()
         result, error = pickle.loads(answer)
         if error is not None:
             raise error
         return result
 
-    def end(self, patience: float = TERMINATE_TIMEOUT) -> None:
-        """End the process, even during a call; the next call starts a new one. patience: time from SIGTERM to
-        SIGKILL [s]."""
-        end_workers([self], patience)
+    def end(self) -> None:
+        """Kill the process, even during a call; the next call starts a new one."""
+        end_workers([self], 0.0)
 
-    def close(self, patience: float = TERMINATE_TIMEOUT) -> None:
-        """End the process; later calls raise EndedError."""
+    def close(self) -> None:
+        """Kill the process; later calls raise EndedError."""
         self._closed = True
-        self.end(patience)
+        self.end()
 
 
 # Workers whose processes may run
@@ -235,7 +236,7 @@ _started: "WeakSet[Worker]" = WeakSet()
 
 
 def end_workers(workers: Iterable[Worker], patience: float) -> None:
-    """End the processes of workers together; see `Worker.end`."""
+    """End the processes of workers together. patience: time from SIGTERM to SIGKILL [s]."""
     processes = []
     for worker in workers:
         with worker._starting:
@@ -256,13 +257,13 @@ def end_workers(workers: Iterable[Worker], patience: float) -> None:
 @atexit.register
 def _end_all() -> None:
     for worker in list(_started):
-        worker.close(0.0)
+        worker.close()
 
 
 class Call(Future):
     """The future result of a call that waits for a worker or runs in one."""
 
-    def __init__(self, call: Callable[..., Any], arguments: tuple, timeout: float) -> None:
+    def __init__(self, call: Function, arguments: tuple, timeout: float) -> None:
         super().__init__()
         self._call = call
         self._arguments = arguments
@@ -296,7 +297,7 @@ class Workers:
     def __init__(
         self,
         count: int,
-        prepare: Callable[..., object] = _nothing,
+        prepare: Function = _nothing,
         arguments: tuple = (),
         patience: float = TERMINATE_TIMEOUT,
         keep_ready: bool = False,
@@ -357,7 +358,7 @@ class Workers:
             if isinstance(error, NotStartedError):
                 self._not_started = error
 
-    def submit(self, call: Callable[..., Any], *arguments: Any, timeout: float = inf) -> Call:
+    def submit(self, call: Function, *arguments: Any, timeout: float = inf) -> Call:
         """The future of `call(*arguments)` in the next idle process; its exceptions are those of
         `Worker.call`."""
         submitted = Call(call, arguments, timeout)
@@ -387,7 +388,7 @@ class Workers:
             self._calls.put(None)
         end_workers(self.workers, self._patience)
 
-    def each(self, call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
+    def each(self, call: Function, calls: Sequence[tuple]) -> Results:
         """Results of `call(*arguments)` for each of `calls`.
 
         The number of calls that run or wait is at most the number of processes plus one. Raises InputError if
@@ -416,7 +417,7 @@ def _fail(call: Call, error: Exception) -> None:
         call.set_exception(error)
 
 
-def on_this_machine(call: Callable[..., Any], calls: Sequence[tuple], workers: int) -> Results:
+def on_this_machine(call: Function, calls: Sequence[tuple], workers: int) -> Results:
     """`Workers.each` with processes for these calls only; with one worker, the calls run in this process."""
     with Workers(min(workers, len(calls)) if workers > 1 else 0) as pool:
         yield from pool.each(call, calls)
@@ -559,7 +560,7 @@ MAX_RETRIES = 20
 process has died."""
 
 
-def on_ray(call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
+def on_ray(call: Function, calls: Sequence[tuple]) -> Results:
     """Run the calls on a Ray cluster, one core each; calls of a lost node or process are repeated.
 
     See `ray_cluster`. Each node needs this package and, under the same paths, the files that the calls read.
@@ -578,12 +579,12 @@ def on_ray(call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
                 yield running.pop(reference), ray.get(reference)
 
 
-def _on_node(entries: AddedEntries, call: Callable[..., Any], arguments: tuple) -> Any:
+def _on_node(entries: AddedEntries, call: Function, arguments: tuple) -> Any:
     adopt_entries(entries)
     return call(*arguments)
 
 
-CLUSTERS: dict[str, Callable[[Callable[..., Any], Sequence[tuple]], Results]] = {"ray": on_ray}
+CLUSTERS: dict[str, Callable[[Function, Sequence[tuple]], Results]] = {"ray": on_ray}
 """Cluster backends by the name that --cluster takes."""
 
 
@@ -605,11 +606,12 @@ def ray_cluster() -> Iterator[Any]:
     started_here = not ray.is_initialized()
     if started_here:
         _check_reachable(os.environ.get("RAY_ADDRESS", ""))
-    connected = False
     try:
-        if started_here:
-            ray.init(log_to_driver=False, logging_level=logging.CRITICAL)
-        connected = True
+        try:
+            if started_here:
+                ray.init(log_to_driver=False, logging_level=logging.CRITICAL)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            raise InputError(f"no Ray cluster: {error}") from None
         yield ray
     except RayTaskError as error:
         if isinstance(error.cause, InputError):
@@ -621,10 +623,6 @@ def ray_cluster() -> Iterator[Any]:
         raise
     except RayError as error:
         raise InputError(f"the Ray cluster failed: {error}; {RERUN_HINT}") from None
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        if connected:
-            raise
-        raise InputError(f"no Ray cluster: {error}") from None
     finally:
         if started_here:
             ray.shutdown()

@@ -53,13 +53,15 @@ def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robo
     """
     check_type("robot", name, (str, PathLike), "its name, or the path of its folder, URDF or MuJoCo model")
     name = name if isinstance(name, str) else Path(name)
-    text = str(name)
-    if names_a_file(name) and is_file(Path(name) / ROBOT_FILE):
-        robot = _read(Path(name), str(Path(name).resolve()))
-    elif names_a_file(name):
-        robot = _from_urdf(Path(name))
+    path = Path(name)
+    if not names_a_file(name):
+        robots = known_robots()
+        check_name("robot", name, robots)
+        robot = _read(robots[str(name)], None if name in ROBOTS else str(name))
+    elif is_file(path / ROBOT_FILE):
+        robot = _read(path, str(path.resolve()))
     else:
-        robot = _by_name(text)
+        robot = _from_urdf(path)
     return robot.with_locked(locked or {})
 
 
@@ -70,12 +72,6 @@ def names_a_file(name: str | Path) -> bool:
     by_form = text.endswith(FILE_ENDINGS) or "/" in text or "\\" in text
     folder = text not in ROBOTS and is_file(Path(name) / ROBOT_FILE)
     return by_form or isinstance(name, Path) or folder
-
-
-def _by_name(name: str) -> Robot:
-    robots = known_robots()
-    check_name("robot", name, robots)
-    return _read(robots[name], None if name in ROBOTS else name)
 
 
 def _read(folder: Path, source: str | None) -> Robot:

@@ -1,6 +1,7 @@
 """Bodies of links: convex meshes, surfaces, inertias, and bodies that are attached to links."""
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
+from types import NoneType
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -8,7 +9,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.errors import MAX_COORDINATE, InputError, numbers, shown, within
+from robotdiffuse.core.errors import MAX_COORDINATE, InputError, check_type, numbers, shown, within
 from robotdiffuse.core.types import (
     GivenVector,
     Points,
@@ -27,12 +28,17 @@ POLYGON_SIDES = 32
 """Number of sides of the polygons that stand for circles."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Surface(Value):
     """A triangle mesh in the frame of its link [m]; it may be open."""
 
     vertices: Points
     faces: Int[ndarray, "f 3"]
+
+    @property
+    def triangles(self) -> Float[ndarray, "f 3 3"]:
+        """The corners of each face."""
+        return self.vertices[self.faces]
 
 
 class ConvexMesh(Surface):
@@ -69,7 +75,7 @@ class EqualByContent(Value):
         return _content(self) == _content(other)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class AttachedBody(EqualByContent):
     """A tool or held object: a body that is fixed to a link of a robot and becomes a link itself."""
 
@@ -166,6 +172,5 @@ class Payload(EqualByContent):
             raise InputError(
                 f"payload.moments is {shown(self.moments)}; none may be larger than the other two together"
             )
-        if self.link is not None and not isinstance(self.link, str):
-            raise InputError(f"payload.link is {shown(self.link)}; it must be the name of a link")
+        check_type("payload.link", self.link, (str, NoneType), "the name of a link")
         super().__post_init__()

@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, rigid_transform, shown
 from robotdiffuse.core.settings import Count, Settings
-from robotdiffuse.core.types import Configuration, Configurations, Mask, Pose, for_kernels
+from robotdiffuse.core.types import Configuration, Configurations, Mask, Pose, for_kernels, nearest_first
 from robotdiffuse.robots.ik_kernel import CONTINUOUS, PRISMATIC, REVOLUTE, IKChain, IKParameters, solve_seeds
 from robotdiffuse.robots.kinematic_tree import KinematicTree
 
@@ -122,8 +122,7 @@ def inverse_kinematics(
             break
     if near is None:
         return accepted
-    accepted = robot.nearest_turns(accepted, near)
-    return accepted[np.argsort(np.linalg.norm(accepted - near, axis=1), kind="stable")]
+    return nearest_first(robot.nearest_turns(accepted, near), near)
 
 
 def each_pose(

@@ -1,7 +1,7 @@
 """Joints and links of a robot, and what follows from them: limits, frames, their poses, chains of joints."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property, wraps
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,6 +21,8 @@ from robotdiffuse.core.types import (
     Spheres,
     Value,
     Vector,
+    for_kernels,
+    frozen_dataclass,
     read_only,
 )
 
@@ -47,7 +49,7 @@ class Mimic(NamedTuple):
     offset: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Joint(Value):
     """A joint of the URDF tree. Fixed joints have no meaningful limits."""
 
@@ -77,6 +79,11 @@ class Joint(Value):
         """The unit of the joint's values."""
         return "m" if self.kind == "prismatic" else "rad"
 
+    @property
+    def movable(self) -> bool:
+        """Whether the joint can move."""
+        return self.kind in MOVING_KINDS
+
     def motion(self, q: Any) -> Float[ndarray, "*n 4 4"]:
         """T_joint_child at joint values q [*n] [rad] or [m]."""
         values = np.asarray(q)[..., None, None]
@@ -90,10 +97,10 @@ class Joint(Value):
 
 def with_mimics(joints: tuple[Joint, ...], locked: dict[str, Any]) -> dict[str, Any]:
     """The values of locked joints, including the joints that mimic them, by name [rad] or [m]."""
-    by_name = {joint.name: joint for joint in joints}
+    mimics = {joint.name: joint.mimic for joint in joints if joint.mimic}
 
     def value(name: str) -> Any:
-        mimic = by_name[name].mimic if name in by_name else None
+        mimic = mimics.get(name)
         followed = None if mimic is None else value(mimic.joint)
         return (
             locked.get(name)
@@ -101,7 +108,7 @@ def with_mimics(joints: tuple[Joint, ...], locked: dict[str, Any]) -> dict[str, 
             else mimic.multiplier * followed + mimic.offset
         )
 
-    values = {name: value(name) for name in (*locked, *(joint.name for joint in joints if joint.mimic))}
+    values = {name: value(name) for name in (*locked, *mimics)}
     return {name: number for name, number in values.items() if number is not None}
 
 
@@ -186,8 +193,8 @@ class KinematicTree(Value):
                 first.setdefault(joint.name, i)
         # chains that share their first joints follow each other
         chains.sort(key=lambda chain: [first[joint.name] for joint in chain])
-        ordered = {joint.name: joint for chain in chains for joint in chain}.values()
-        return tuple(j for j in ordered if j.kind in MOVING_KINDS and j.name not in self.locked)
+        ordered = dict.fromkeys(joint for chain in chains for joint in chain)
+        return tuple(j for j in ordered if j.movable and j.name not in self.locked)
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
@@ -204,6 +211,11 @@ class KinematicTree(Value):
     jerk = _limit("jerk")
     effort = _limit("effort")
     """Largest torques [N m] or forces [N]; 0 where the URDF gives none."""
+
+    @property
+    def middle(self) -> Configuration:
+        """The configuration in the middle of the joint limits."""
+        return 0.5 * (self.lower + self.upper)
 
     def narrowed_limits(self, margin: float) -> tuple[JointValues, JointValues]:
         """Lower and upper limits narrowed by a margin [rad] or [m], at most to the middle of the range."""
@@ -242,8 +254,7 @@ class KinematicTree(Value):
     def unwound(self, q: JointArray) -> JointArray:
         """Equivalent configurations: joints with a range above one turn are turned by whole turns to within
         half a turn of the middle of their limits."""
-        middle = 0.5 * (self.lower + self.upper)
-        return np.where(self._more_than_a_turn, q - TURN * np.round((q - middle) / TURN), q)
+        return np.where(self._more_than_a_turn, q - TURN * np.round((q - self.middle) / TURN), q)
 
     def equivalent_configurations(self, q: Configuration, start: Configuration) -> Configurations:
         """`turned_both_ways` for the joints that have limits and a range above one turn."""
@@ -327,6 +338,11 @@ class KinematicTree(Value):
         """
         return None if (self.parents == np.arange(self.dof)).all() else self.parents.copy()
 
+    @property
+    def kernel_joints(self) -> tuple[Any, ...]:
+        """`frame_offsets`, `kernel_parents` and `prismatic` for compiled code, as writable arrays."""
+        return for_kernels(self.frame_offsets), self.kernel_parents, np.array(self.prismatic, np.bool_)
+
     @cached_property
     def moved_by(self) -> Bool[ndarray, "frames dof"]:
         """Which planned joints move which frames."""
@@ -352,10 +368,7 @@ class KinematicTree(Value):
         planned.
         """
         near, far = sorted(
-            (
-                [joint.name for joint in self.joints_above(link) if joint.kind in MOVING_KINDS]
-                for link in (a, b)
-            ),
+            ([joint.name for joint in self.joints_above(link) if joint.movable] for link in (a, b)),
             key=len,
         )
         between = far[len(near) :] if far[: len(near)] == near else ()

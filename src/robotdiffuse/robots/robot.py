@@ -30,7 +30,7 @@ from robotdiffuse.core.errors import (
     within,
 )
 from robotdiffuse.core.settings import Natural, converted
-from robotdiffuse.core.types import Mask, Pose, Spheres, Value, Values
+from robotdiffuse.core.types import Mask, Pose, Spheres, Value, Values, frozen_dataclass
 from robotdiffuse.robots.bodies import (
     TOOL,
     AttachedBody,
@@ -54,7 +54,7 @@ ROUNDING = 1e-5
 """Upper bound on the rounding error of a joint value [rad] or [m]."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class LinkPairTable(Value):
     """Where the convex parts of two links are apart, as a function of the one or two joints between them."""
 
@@ -74,7 +74,7 @@ class LinkPairTable(Value):
         inside = np.ones(len(values[0]), dtype=bool)
         index = []
         for axis, value in enumerate(values):
-            cell = np.floor((value - self.lower[axis]) / self._edge(axis)).astype(int)
+            cell = self._cell(axis, value)
             count = self.apart.shape[axis]
             if not self._whole(axis):
                 inside &= (cell >= 0) & (cell < count)
@@ -96,8 +96,9 @@ class LinkPairTable(Value):
                 touch |= np.expand_dims(beyond, tuple(i for i in range(len(intervals)) if i != axis))
         return ~touch.astype(bool)
 
-    def _edge(self, axis: int) -> float:
-        return (self.upper[axis] - self.lower[axis]) / self.apart.shape[axis]
+    def _cell(self, axis: int, value: Values) -> ndarray:
+        edge = (self.upper[axis] - self.lower[axis]) / self.apart.shape[axis]
+        return np.floor((value - self.lower[axis]) / edge).astype(int)
 
     def _whole(self, axis: int) -> bool:
         return abs(self.upper[axis] - self.lower[axis] - TURN) < ROUNDING
@@ -105,8 +106,8 @@ class LinkPairTable(Value):
     def _reached(self, axis: int, low: Values, high: Values) -> Bool[ndarray, "n cells"]:
         """Which cells along a joint each interval overlaps."""
         count = self.apart.shape[axis]
-        first = np.floor((low - ROUNDING - self.lower[axis]) / self._edge(axis)).astype(int)
-        last = np.floor((high + ROUNDING - self.lower[axis]) / self._edge(axis)).astype(int)
+        first = self._cell(axis, low - ROUNDING)
+        last = self._cell(axis, high + ROUNDING)
         steps = np.arange((last - first).max(initial=0) + 1)
         cell = np.minimum(first[:, None] + steps, last[:, None])
         cell = cell % count if self._whole(axis) else np.clip(cell, 0, count - 1)

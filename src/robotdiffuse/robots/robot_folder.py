@@ -72,7 +72,7 @@ FILE_ENDINGS = (".urdf", ".xacro", ".xml", ".sdf", ".usd", ".usda", ".usdc", ".u
 MESH_FILE = "meshes.npz"
 
 
-def write_robot_folder(robot: Robot, folder: str | Path, source: JsonObject) -> None:
+def write_robot_folder(robot: Robot, folder: Path, source: JsonObject) -> None:
     """Write meshes.npz, for grazing links surfaces.npz, and robot.json into a folder. Each file is written
     atomically; other files in the folder stay.
 
@@ -82,7 +82,6 @@ def write_robot_folder(robot: Robot, folder: str | Path, source: JsonObject) -> 
     configurations in which covering spheres collide falsely. Raises InputError if the folder cannot be
     written.
     """
-    folder = Path(folder)
     arrays = _packed([(link, mesh) for link, meshes in robot.meshes.items() for mesh in meshes])
     files = {MESH_FILE: _npz(arrays)}
     if robot.grazing:
@@ -111,9 +110,8 @@ def _npz(arrays: dict[str, ndarray]) -> bytes:
     return content.getvalue()
 
 
-def read_robot_folder(folder: str | Path) -> Robot:
+def read_robot_folder(folder: Path) -> Robot:
     """Read the robot in a folder; raises InputError that names the file if one is missing or damaged."""
-    folder = Path(folder)
     data = _read_json(folder / ROBOT_FILE)
     meshes: dict[str, tuple[ConvexMesh, ...]] = {}
     arrays = read_arrays(folder / MESH_FILE)
@@ -172,9 +170,9 @@ def _check_tree(robot: Robot) -> None:
             raise ValueError(f"spheres of {link}: a radius is {rows[:, 3].min():g}; it must be positive")
 
 
-def read_source(folder: str | Path) -> JsonObject:
+def read_source(folder: Path) -> JsonObject:
     """The `source` of a robot folder, as given to `write_robot_folder`."""
-    source = _read_json(Path(folder) / ROBOT_FILE).get("source", {})
+    source = _read_json(folder / ROBOT_FILE).get("source", {})
     return source if isinstance(source, dict) else {}
 
 
@@ -188,7 +186,7 @@ def _to_json(robot: Robot, source: JsonObject) -> dict:
         "the link's axes",
         "base": robot.base,
         "tip": robot.tip,
-        **({"other_tips": list(robot.other_tips)} if robot.other_tips else {}),
+        **({"other_tips": robot.other_tips} if robot.other_tips else {}),
         "root": robot.root or robot.base,
         "above": {link: pose_entry(T_base_link) for link, T_base_link in robot.above.items()},
         "locked": robot.locked,
@@ -198,7 +196,7 @@ def _to_json(robot: Robot, source: JsonObject) -> dict:
         "inertias": {link: inertia.values for link, inertia in robot.inertias.items()},
         "allowed_collisions": sorted(sorted(pair) for pair in robot.allowed_collisions),
         **({"tables": [_table_to_json(table) for table in robot.tables]} if robot.tables else {}),
-        "notes": list(robot.notes),
+        "notes": robot.notes,
     }
 
 
@@ -206,10 +204,10 @@ def _table_to_json(table: LinkPairTable) -> dict:
     """JSON entry of a table. Cells along the last joint are packed as bits; each row is a hexadecimal
     string."""
     return {
-        "links": list(table.links),
-        "joints": list(table.joints),
-        "lower": list(table.lower),
-        "upper": list(table.upper),
+        "links": table.links,
+        "joints": table.joints,
+        "lower": table.lower,
+        "upper": table.upper,
         "apart": [row.tobytes().hex() for row in np.packbits(np.atleast_2d(table.apart), axis=1)],
     }
 
@@ -235,12 +233,12 @@ def _joint_to_json(joint: Joint) -> dict:
         "child": joint.child,
         **pose_entry(joint.T_parent_joint),
     }
-    if joint.kind in MOVING_KINDS:
+    if joint.movable:
         data |= {"axis": joint.axis.tolist()} | {name: getattr(joint, name) for name in LIMITS}
     if joint.effort:
         data["effort"] = joint.effort
     if joint.mimic is not None:
-        data["mimic"] = list(joint.mimic)
+        data["mimic"] = joint.mimic
     return data
 
 

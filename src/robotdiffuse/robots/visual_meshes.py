@@ -1,13 +1,12 @@
 """Visual meshes for drawing robots. Planning and validation never use them."""
 
-from dataclasses import dataclass
 from importlib.resources import as_file, files
 
 import numpy as np
 from jaxtyping import Int, UInt8
 from numpy import ndarray
 
-from robotdiffuse.core.types import Points, Value
+from robotdiffuse.core.types import Points, Value, frozen_dataclass
 from robotdiffuse.robots.robot import Robot
 
 UNIT = 5e-5
@@ -21,7 +20,7 @@ HELD_COLOR = (0xE3, 0xB2, 0x3C)
 TOOL_COLOR = (0xB0, 0xB6, 0xBE)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class VisualMesh(Value):
     """A triangle mesh in the frame of its link [m], with one sRGB color per face."""
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from robotdiffuse.core.transforms import scaled_normals
 from robotdiffuse.robots.bodies import ConvexMesh, polygon_around_circle
 from robotdiffuse.robots.fitting.convex_parts import Surface, convex_hull, convex_parts
 
@@ -21,9 +22,9 @@ def capsule_polyhedron(radius: float, height: float) -> ConvexMesh:
     corners = np.concatenate([*rings, [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]])
     hull = convex_hull(corners)
     # scale the polyhedron up until the sphere is inside all faces
-    a, b, c = np.moveaxis(hull.vertices[hull.faces], 1, 0)
-    normals = np.cross(b - a, c - a)
-    inradius = (np.einsum("fd,fd->f", normals, a) / np.linalg.norm(normals, axis=1)).min()
+    triangles = hull.vertices[hull.faces]
+    normals = scaled_normals(triangles)
+    inradius = (np.einsum("fd,fd->f", normals, triangles[:, 0]) / np.linalg.norm(normals, axis=1)).min()
     corners *= radius / inradius
     if height == 0:
         return convex_hull(corners)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.core.errors import MAX_RPY, InputError, check_name, located, shown, vector
+from robotdiffuse.core.errors import MAX_RPY, InputError, check_name, check_type, located, shown, vector
 from robotdiffuse.core.files import JsonObject, known_ending, read_array
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
@@ -35,19 +35,14 @@ FILE_CONTENT = {"mesh": ("vertices", "faces"), "point_cloud": ("points",), "heig
 """For each kind of shape that may be read from a file, the fields that the file contains."""
 
 
-def check_fields(
-    where: str, data: object, required: Iterable[str], optional: Iterable[str] = ()
-) -> JsonObject:
+def check_fields(where: str, data: Any, required: Iterable[str], optional: Iterable[str] = ()) -> JsonObject:
     """The data, with a field `rpy` converted to `wxyz`.
 
     Raises InputError unless `data` is a mapping with all required fields and without unknown fields.
     """
     required = tuple(required)
     field_names = tuple(dict.fromkeys((*required, *optional)))
-    if not isinstance(data, dict):
-        raise InputError(
-            f"{where} is {shown(data)}; it must be a mapping with the fields {', '.join(field_names)}"
-        )
+    check_type(where, data, dict, f"a mapping with the fields {', '.join(field_names)}")
     if "rpy" in data and "wxyz" in field_names:
         if "wxyz" in data:
             raise InputError(f"{where} has both wxyz and rpy; give one of them")
@@ -73,7 +68,7 @@ def only_field(where: str, entry: object, kinds: Collection[str], what: str) -> 
 
 
 def read_scene(
-    entries: object, folder: Path, contacts: object = (), field: str = "scene"
+    entries: Any, folder: Path, contacts: object = (), field: str = "scene"
 ) -> tuple[Scene, tuple[str, ...]]:
     """The scene that a list of shapes in a problem file describes, and notes on changes that were made to it.
 
@@ -81,11 +76,8 @@ def read_scene(
     unknown shapes and fields, values of the wrong type and files that cannot be read. The message starts with
     the place in the problem file, e.g. scene[2].
     """
-    if not isinstance(entries, list):
-        raise InputError(
-            f"{field} is {shown(entries)}; it must be a list of shapes"
-            + (" or the name of a MoveIt scene file" if field == "scene" else "")
-        )
+    or_file = " or the name of a MoveIt scene file" if field == "scene" else ""
+    check_type(field, entries, list, f"a list of shapes{or_file}")
     notes: list[str] = []
     shapes = [read_shape(f"{field}[{i}]", entry, folder, notes) for i, entry in enumerate(entries)]
     scene = Scene(shapes, contacts)  # type: ignore[arg-type]
@@ -178,7 +170,7 @@ def scene_entries(scene: Scene, folder: Path | None) -> list[dict[str, dict[str,
                 values["heights"] = heights.tolist()
         else:
             values = plain_fields(shape, "file", *FILE_CONTENT[shape.kind])
-            values = {"file": name_from(folder, Path(shape.file)), **values}
+            values = {"file": name_from(folder, Path(shape.file)), **values}  # type: ignore[attr-defined]
         if values["name"] == shape.kind:
             del values["name"]
         if values.get("wxyz") == list(IDENTITY):

@@ -51,6 +51,7 @@ from robotdiffuse.core.types import (
     frozen_dataclass,
     no_type_check,
     read_only,
+    step_lengths,
 )
 from robotdiffuse.robots.robot import Robot, check_robot
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
@@ -108,8 +109,7 @@ class Scene(Value):
         if not np.iterable(shapes):
             raise InputError(f"scene is {shown(shapes)}; it must be a list of shapes, e.g. [rd.Sphere(...)]")
         for i, shape in enumerate(shapes):
-            if not isinstance(shape, Shape):
-                raise InputError(f"scene[{i}] is {shown(shape)}; it must be a shape, e.g. rd.Sphere")
+            check_type(f"scene[{i}]", shape, Shape, "a shape, e.g. rd.Sphere")
             name = shape.name
             number = last.get(shape.name, 1)
             while name in names_in_use:
@@ -348,7 +348,7 @@ def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
         name = model.geom(geom).name or bodies[body] or f"geom{geom}"
         T = T_base_world @ transform(placed.geom_xpos[geom], placed.geom_xmat[geom].reshape(3, 3))
         center = T[:3, 3]
-        wxyz = quaternion_from_rotation(T[:3, :3])
+        wxyz = quaternion_from_rotation(T)
         size = model.geom_size[geom]
         match mjcf.kind_of("Geom", model.geom_type[geom]):
             case "plane":
@@ -417,8 +417,7 @@ class MovingObstacle(Value):
     max_speed: float | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.shape, Shape):
-            raise InputError(f"moving: shape is {shown(self.shape)}; it must be a shape, e.g. rd.Sphere")
+        check_type("moving: shape", self.shape, Shape, "a shape, e.g. rd.Sphere")
         _ = self.shape.T_base_shape  # raises InputError for shapes that have no frame
         motions = {
             "velocity": self.velocity is not None,
@@ -549,7 +548,7 @@ class MovingObstacle(Value):
         xyz = poses[i, :3, 3] + fraction * (poses[i + 1, :3, 3] - poses[i, :3, 3])
         if np.array_equal(poses[i, :3, :3], poses[i + 1, :3, :3]):
             return transform(xyz, poses[i, :3, :3])
-        a, b = (quaternion_from_rotation(poses[k, :3, :3]) for k in (i, i + 1))
+        a, b = (quaternion_from_rotation(poses[k]) for k in (i, i + 1))
         return transform(xyz, rotation_from_quaternion(_slerp(a, b, fraction)))
 
     def at(self, time: float) -> Shape:
@@ -587,7 +586,7 @@ class MovingObstacle(Value):
 def track_speeds(times: Values, poses: Poses, radius: float) -> Float[ndarray, "intervals"]:
     """Upper bounds on the speed between successive times [m/s], for points within `radius` [m] of the origin
     of the moving frame."""
-    distances_between = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    distances_between = step_lengths(poses[:, :3, 3])
     turns = [rotation_angle(a.T @ b) for a, b in zip(poses[:-1, :3, :3], poses[1:, :3, :3], strict=True)]
     return (distances_between + radius * np.array(turns)) / np.diff(times)
 

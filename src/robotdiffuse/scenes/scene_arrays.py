@@ -1,14 +1,13 @@
 """Scenes of spheres and boxes, packed in arrays for data sets and for training batches."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int8
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Mask
+from robotdiffuse.core.types import Mask, frozen_dataclass
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Shape, Sphere
 
@@ -20,7 +19,7 @@ PARAMETERS = 10
 """Number of parameters of a shape; see `PackedScenes.params`."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class PackedScenes:
     """n scenes of at most k spheres and boxes each, with an optional floor. Lengths are in [m].
 

@@ -8,7 +8,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -31,7 +31,13 @@ from robotdiffuse.core.errors import (
     vector,
 )
 from robotdiffuse.core.mesh_files import read_triangles
-from robotdiffuse.core.transforms import placed, quaternion_from_rotation, rotation_from_quaternion, transform
+from robotdiffuse.core.transforms import (
+    placed,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    scaled_normals,
+    transform,
+)
 from robotdiffuse.core.types import (
     GivenArray,
     GivenVector,
@@ -105,13 +111,10 @@ class Shape(Value, ABC):
         from robotdiffuse.scenes.convex_solids import SOLIDS  # imports SciPy, which few problems need
 
         if self.kind not in SOLIDS:
-            raise self._not_solid()
+            raise InputError(
+                f"{self.name!r} is a {self.kind}; it must be one of sphere, box, cylinder, capsule and mesh"
+            )
         return self.T_base_shape, SOLIDS[self.kind](self)
-
-    def _not_solid(self) -> InputError:
-        return InputError(
-            f"{self.name!r} is a {self.kind}; it must be one of sphere, box, cylinder, capsule and mesh"
-        )
 
     def __post_init__(self) -> None:
         """Checks the fields that `CHECKS` names. Raises InputError for the first wrong value."""
@@ -121,8 +124,7 @@ class Shape(Value, ABC):
         super().__post_init__()
 
 
-def _vector(kind: str, name: str, value: object) -> ndarray:
-    return vector(kind, name, value, 3)
+_vector = partial(vector, size=3)
 
 
 def _name(kind: str, name: str, value: object) -> object:
@@ -132,7 +134,7 @@ def _name(kind: str, name: str, value: object) -> object:
 
 
 def _size(kind: str, name: str, value: object) -> ndarray:
-    size = vector(kind, name, value, 3)
+    size = _vector(kind, name, value)
     if (size < MIN_SIZE).any():
         raise InputError(
             f"{kind}.size is {shown(value)}; edge lengths must be positive, at least {MIN_SIZE:g} m"
@@ -223,7 +225,7 @@ class _Posed(Shape):
 
     def moved(self, T: Pose) -> "Shape":
         T = rigid_motion(T) @ self.T_base_shape
-        moved: dict[str, Any] = {self.origin: T[:3, 3], "wxyz": quaternion_from_rotation(T[:3, :3])}
+        moved: dict[str, Any] = {self.origin: T[:3, 3], "wxyz": quaternion_from_rotation(T)}
         return replace(self, **moved)  # type: ignore[type-var]
 
 
@@ -257,18 +259,7 @@ class Box(_Posed):
 
 @no_type_check
 @frozen_dataclass
-class _Axial(_Posed):
-    """A shape that is symmetric about its own z axis."""
-
-    center: GivenVector
-    radius: float
-    height: float
-    wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
-
-
-@no_type_check
-@frozen_dataclass
-class Cylinder(_Axial):
+class Cylinder(_Posed):
     """A cylinder about its own z axis.
 
     Args:
@@ -279,8 +270,9 @@ class Cylinder(_Axial):
         name: Name in results, commands and allowed contacts.
     """
 
-    # declared again, because mypy lets constructors take only the stored types of inherited fields
     center: GivenVector
+    radius: float
+    height: float
     wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     name: str = "cylinder"
     kind: ClassVar[str] = "cylinder"
@@ -298,7 +290,7 @@ class Cylinder(_Axial):
 
 @no_type_check
 @frozen_dataclass
-class Capsule(_Axial):
+class Capsule(_Posed):
     """A cylinder about its own z axis with a half sphere at each end.
 
     Args:
@@ -309,8 +301,9 @@ class Capsule(_Axial):
         name: Name in results, commands and allowed contacts.
     """
 
-    # declared again, because mypy lets constructors take only the stored types of inherited fields
     center: GivenVector
+    radius: float
+    height: float
     wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     name: str = "capsule"
     kind: ClassVar[str] = "capsule"
@@ -424,11 +417,12 @@ class Triangulated(Shape):
 
     @property
     def area(self) -> float:
-        return self.mesh.area
+        return float(self.mesh.face_areas.sum())
 
     @property
     def bounds(self) -> Corners:
-        return self.mesh.bounds
+        vertices = self.mesh.world_vertices
+        return np.stack([vertices.min(axis=0), vertices.max(axis=0)])
 
 
 @no_type_check
@@ -511,16 +505,7 @@ class Mesh(_Posed, Triangulated):
 
     @cached_property
     def face_areas(self) -> Values:
-        a, b, c = np.moveaxis(self.vertices[self.faces], 1, 0)
-        return read_only(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
-
-    @property
-    def area(self) -> float:
-        return float(self.face_areas.sum())
-
-    @property
-    def bounds(self) -> Corners:
-        return np.stack([self.world_vertices.min(axis=0), self.world_vertices.max(axis=0)])
+        return read_only(np.linalg.norm(scaled_normals(self.vertices[self.faces]), axis=1) / 2)
 
 
 @no_type_check

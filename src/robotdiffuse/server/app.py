@@ -352,8 +352,8 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
         body = await read_body(request, pool, JSON)
         with pool.admit(1):
             task = asyncio.ensure_future(pool.run(endpoint, body))
-            with _cancellable(name, running, [task]):
-                answer = await answer_of(task, asyncio.ensure_future(wait_for_disconnect(request)))
+            with _cancellable(request, name, running, [task]) as disconnected:
+                answer = await answer_of(task, disconnected)
                 return Response(answer.body, answer.code, media_type=JSON)
 
     @app.post(
@@ -400,8 +400,8 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
             at_once = min(len(lines), settings.workers)
             with pool.admit(at_once):
                 tasks = plan_tasks(pool, lines, at_once)
-                with _cancellable(name, running, tasks):
-                    await send_lines(send, tasks, asyncio.ensure_future(wait_for_disconnect(request)))
+                with _cancellable(request, name, running, tasks) as disconnected:
+                    await send_lines(send, tasks, disconnected)
 
         return StreamedResponse(write)
 
@@ -474,10 +474,12 @@ def endpoint_list(app: FastAPI) -> str:
 
 @contextmanager
 def _cancellable(
-    name: str, running: dict[str, Callable[[], None]], tasks: list[asyncio.Task[Answer]]
-) -> Iterator[None]:
+    request: Request, name: str, running: dict[str, Callable[[], None]], tasks: list[asyncio.Task[Answer]]
+) -> Iterator[asyncio.Future[None]]:
     """Within the block, the tasks of a request can be cancelled by the request's name. Tasks that the block
-    leaves unfinished are cancelled. Raises RequestError for a name that is too long or in use."""
+    leaves unfinished are cancelled. Yields a future that is done once the client has closed the connection.
+    Raises RequestError for a name that is too long or in use."""
+    disconnected = asyncio.ensure_future(wait_for_disconnect(request))
 
     def cancel() -> None:
         for task in tasks:
@@ -490,8 +492,9 @@ def _cancellable(
             raise RequestError(409, f"another request {shown(name)} is running")
         if name:
             running[name] = cancel
-        yield
+        yield disconnected
     finally:
+        disconnected.cancel()
         if running.get(name) is cancel:
             del running[name]
         cancel()
@@ -569,10 +572,7 @@ async def wait_for_disconnect(request: Request) -> None:
 
 async def answer_of(task: asyncio.Task[Answer], disconnected: asyncio.Future[None]) -> Answer:
     """The answer of the task, or an error if it is cancelled or the client disconnects first."""
-    try:
-        await asyncio.wait({task, disconnected}, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        disconnected.cancel()
+    await asyncio.wait({task, disconnected}, return_when=asyncio.FIRST_COMPLETED)
     if not task.done():
         return failed(CLIENT_GONE, "the client closed the connection")
     return failed(409, "the request was cancelled") if task.cancelled() else task.result()
@@ -593,18 +593,14 @@ async def send_lines(
     send: Send, tasks: list[asyncio.Task[Answer]], disconnected: asyncio.Future[None]
 ) -> None:
     """Send the answers in the order of the tasks."""
-    try:
-        headers = [(b"content-type", LINES.encode())]
-        await send({"type": "http.response.start", "status": 200, "headers": headers})
-        for task in tasks:
-            await asyncio.wait({task, disconnected}, return_when=asyncio.FIRST_COMPLETED)
-            if disconnected.done():
-                return
-            answer = failed(409, "the request was cancelled") if task.cancelled() else task.result()
-            await send({"type": "http.response.body", "body": answer.body, "more_body": True})
-        await send({"type": "http.response.body", "body": b""})
-    finally:
-        disconnected.cancel()
+    headers = [(b"content-type", LINES.encode())]
+    await send({"type": "http.response.start", "status": 200, "headers": headers})
+    for task in tasks:
+        answer = await answer_of(task, disconnected)
+        if disconnected.done():
+            return
+        await send({"type": "http.response.body", "body": answer.body, "more_body": True})
+    await send({"type": "http.response.body", "body": b""})
 
 
 class StreamedResponse(Response):

@@ -19,7 +19,7 @@ from robotdiffuse.core.deadline import cancel_check, check_cancelled
 from robotdiffuse.core.errors import InputError, described, shown
 from robotdiffuse.core.files import MEGABYTE, JsonObject, decoded, parse_json
 from robotdiffuse.core.settings import converted
-from robotdiffuse.core.types import RATES, Path, PlanResult, SampleRate, Trajectory, check_motion_arrays
+from robotdiffuse.core.types import RATES, Path, SampleRate, Trajectory, check_motion_arrays
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner
 from robotdiffuse.planning.context import PlanRequest, least_clearances
 from robotdiffuse.planning.planner import Planner
@@ -103,7 +103,7 @@ def accept(robots: dict[str, Robot], settings: ServeSettings) -> None:
 def warm_up() -> bool:
     """Load or compile the code that most requests need; returns whether anything was compiled."""
     name, robot = next(iter(_robots.items()))
-    start = (robot.lower + robot.upper) / 2
+    start = robot.middle
     start[1:2] += 0.3  # if the arm pointed straight up, turning its first joint would not move its tip
     goal = start.copy()
     goal[0] += (robot.upper[0] - start[0]) / 2
@@ -198,7 +198,7 @@ def answer_plan(body: bytes) -> Answer:
     planner.prepare(problem.robot)
     _warm_up_once(planner, problem, requested["problem"]["robot"])
     allow(limit - read_time)
-    result: PlanResult = planner.plan(problem, **call_arguments)
+    result = planner.plan(problem, **call_arguments)
     record = result.record()
     if rate is not None and result.trajectory is not None:
         motion, report = _resampled(problem, result.trajectory, rate)
@@ -231,9 +231,7 @@ def _planner(name: object) -> Planner:
     return _loaded(str(name))
 
 
-@lru_cache(maxsize=64)
-def _loaded(name: str) -> Planner:
-    return load_planner(name)
+_loaded = lru_cache(maxsize=64)(load_planner)
 
 
 def _warm_up_once(planner: Planner, problem: Problem, robot: str) -> None:
@@ -247,7 +245,7 @@ def answer_verify(body: bytes) -> Answer:
     """The answer to a request to validate. Raises InputError for a bad request."""
     values = check_fields("the request", _record(body), ("problem",), MOTIONS)
     problem = _problem(values["problem"])
-    motions = {name: read_motion(name, values[name]) for name in MOTIONS if name in values}
+    motions = {name: read_motion(name, values[name]) for name in MOTIONS if values.get(name) is not None}
     if not motions:
         raise InputError("the request has neither path nor trajectory")
     validator = Verifier(problem)

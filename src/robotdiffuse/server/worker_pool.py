@@ -49,7 +49,7 @@ class WorkerPool:
     """
 
     def __init__(self, robots: dict[str, Robot], settings: ServeSettings) -> None:
-        self.settings, self.metrics = settings, Metrics()
+        self.settings, self.metrics = settings, Metrics(self.state)
         self.admitted = 0
         """Number of requests that wait or run."""
         self.arriving_bytes = 0
@@ -57,8 +57,6 @@ class WorkerPool:
         self.stopping = False
         self._workers = Workers(settings.workers, worker.prepare, (robots, settings), 0.0, keep_ready=True)
         self._request_seconds = INITIAL_REQUEST_SECONDS
-        for name, description in GAUGES.items():
-            self.metrics.gauge(name, description, lambda name=name: self.state()[name])
 
     async def start(self) -> None:
         """Start the workers. The first one compiles, if necessary, for all; the others follow.
@@ -157,7 +155,8 @@ BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 class Metrics:
     """The metrics of one server, in a registry of their own."""
 
-    def __init__(self) -> None:
+    def __init__(self, state: Callable[[], dict[str, int]]) -> None:
+        """`state` returns the values of GAUGES; it is called for each report."""
         self.registry = CollectorRegistry()
         counter = partial(Counter, namespace=PREFIX, registry=self.registry)
         self._requests = counter(
@@ -178,10 +177,9 @@ class Metrics:
         self.renewed_workers = counter(
             "workers_renewed", "Workers replaced because they used too much memory."
         )
-
-    def gauge(self, name: str, description: str, value: Callable[[], float]) -> None:
-        """Add a gauge; `value()` is called for each report."""
-        Gauge(name, description, namespace=PREFIX, registry=self.registry).set_function(value)
+        for name, description in GAUGES.items():
+            gauge = Gauge(name, description, namespace=PREFIX, registry=self.registry)
+            gauge.set_function(lambda name=name: state()[name])
 
     def answered(self, endpoint: str, code: int, status: str, seconds: float) -> None:
         """Count an answer; `seconds` includes the time in the queue [s], `status` is "" for errors."""

@@ -44,13 +44,20 @@ class PyBulletOracle(World):
         """The closest pair of a link and an obstacle, or of two links; None if its distance exceeds `within`
         [m]."""
         self.place(q)
+        candidates = [
+            (link, name, body, -1)
+            for link in self.moving
+            for name, body in self.obstacles.items()
+            if not self.scene.may_touch(link, name)
+        ]
+        candidates += [(a, b, self.body, self.links[b]) for a, b in self.pairs]
         best: OracleContact | None = None
-        for link in self.moving:
-            for name, body in self.obstacles.items():
-                if not self.scene.may_touch(link, name):
-                    best = self._closer(best, within, link, name, body, -1)
-        for a, b in self.pairs:
-            best = self._closer(best, within, a, b, self.body, self.links[b])
+        for link, other, body, index in candidates:
+            points = self.bullet.getClosestPoints(self.body, body, max(within, 0.0), self.links[link], index)
+            distance = min(map(self.gap, points), default=np.inf)
+            if distance <= within:
+                within = distance
+                best = OracleContact(link, other, distance)
         return best
 
     def distance(self, q: Configuration) -> float:
@@ -90,13 +97,3 @@ class PyBulletOracle(World):
         places, q = sample_path(path.positions, step)
         contact = self.check_rows(q, tolerance)
         return None if contact is None else replace(contact, at=float(places[int(contact.at)]))
-
-    def _closer(
-        self, best: OracleContact | None, within: float, link: str, other: str, body: int, index: int
-    ) -> OracleContact | None:
-        """The pair of `link` and `other`, if its distance is at most `within` [m] and at most that of `best`;
-        `best` otherwise. body, index: PyBullet's body and link of `other`."""
-        nearest = within if best is None else best.distance
-        points = self.bullet.getClosestPoints(self.body, body, max(nearest, 0.0), self.links[link], index)
-        distance = min(map(self.gap, points), default=np.inf)
-        return OracleContact(link, other, float(distance)) if distance <= nearest else best

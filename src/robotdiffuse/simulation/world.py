@@ -14,9 +14,10 @@ between two links, therefore has a contact here.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 from xml.etree import ElementTree as Xml
 
 import numpy as np
@@ -26,7 +27,7 @@ import trimesh
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.files import writing
 from robotdiffuse.core.settings import Bound, Positive, Settings
-from robotdiffuse.core.transforms import quaternion_from_rotation, rpy_from_rotation
+from robotdiffuse.core.transforms import rpy_from_rotation, xyzw_of
 from robotdiffuse.core.types import (
     Configuration,
     Configurations,
@@ -35,10 +36,12 @@ from robotdiffuse.core.types import (
     Trajectory,
     Values,
     Vector,
+    frozen_dataclass,
 )
 from robotdiffuse.drawables import Drawable, drawables
+from robotdiffuse.problems.problem import moving_obstacles
 from robotdiffuse.robots.kinematic_tree import Joint
-from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Robot
+from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Robot, moving_pairs
 from robotdiffuse.scenes.scene import MovingObstacle, Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere, Triangulated
 
@@ -65,9 +68,6 @@ class _Simulation:
 
     def __getattr__(self, name: str) -> Any:
         return partial(getattr(pybullet, name), physicsClientId=self._client)
-
-
-W = TypeVar("W", bound="World")
 
 
 class World:
@@ -107,25 +107,23 @@ class World:
             info = bullet.getJointInfo(self.body, index)
             indices[info[1].decode()] = index
             self.links[info[12].decode()] = index
-        self.joints: list[int] = [indices[name] for name in robot.joint_names]
-        self.held: dict[int, float] = {
+        self.joints = [indices[name] for name in robot.joint_names]
+        self.held = {
             indices[joint.name]: robot.locked.get(joint.name, 0.0)
             for joint in robot.joints
             if joint.kind in MOVING_KINDS and joint.name not in robot.joint_names
         }
         """Values of the joints that planning does not move, by PyBullet's index."""
         solid = [link for link in robot.link_names if robot.meshes.get(link)]
-        self.moving: list[str] = [link for link in solid if robot.link_frame(link) > 0]
+        self.moving = [link for link in solid if robot.link_frame(link) > 0]
         """Links with geometry that a planned joint moves."""
-        self.pairs: list[tuple[str, str]] = []
+        self.pairs = [
+            pair for pair in moving_pairs(robot, solid) if frozenset(pair) not in robot.allowed_collisions
+        ]
         """Pairs of links that are checked against each other."""
-        for i, a in enumerate(solid):
-            for b in solid[i + 1 :]:
-                separate_frames = robot.link_frame(a) != robot.link_frame(b)
-                if separate_frames and frozenset((a, b)) not in robot.allowed_collisions:
-                    self.pairs.append((a, b))
-                else:
-                    bullet.setCollisionFilterPair(self.body, self.body, self.links[a], self.links[b], 0)
+        for a, b in combinations(solid, 2):
+            if (a, b) not in self.pairs:
+                bullet.setCollisionFilterPair(self.body, self.body, self.links[a], self.links[b], 0)
         for index, value in self.held.items():
             bullet.resetJointState(self.body, index, value)
         self.obstacles: dict[str, int] = {}
@@ -134,7 +132,7 @@ class World:
         """PyBullet's collision shape of each mesh, by its vertices and faces. Shapes are reused, because
         PyBullet never frees the memory of a mesh."""
 
-    def __enter__(self: W) -> W:
+    def __enter__(self) -> "World":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -152,9 +150,7 @@ class World:
             self.bullet.removeBody(body)
         self.scene = scene
         # as in a problem, obstacles of equal names are numbered
-        shapes = Scene([*scene.shapes, *(obstacle.shape for obstacle in moving)]).shapes[len(scene.shapes) :]
-        moving = [replace(obstacle, shape=shape) for obstacle, shape in zip(moving, shapes, strict=True)]
-        scene_drawables = drawables(scene, moving)
+        scene_drawables = drawables(scene, moving_obstacles(moving, scene))
         self._moving_obstacles = [drawable for drawable in scene_drawables if drawable.moving is not None]
         self.obstacles = {drawable.name: self._add(drawable) for drawable in scene_drawables}
         for link, index in self.links.items():
@@ -228,8 +224,7 @@ class World:
 
 def _pose(T: Pose) -> tuple[list[float], list[float]]:
     """Position and quaternion xyzw."""
-    w, *xyz = quaternion_from_rotation(T[:3, :3]).tolist()
-    return T[:3, 3].tolist(), [*xyz, w]
+    return T[:3, 3].tolist(), xyzw_of(T).tolist()
 
 
 def write_urdf(robot: Robot, folder: Path) -> Path:
@@ -363,7 +358,7 @@ class ReplayContact:
     """
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Replay:
     """The result of a replay."""
 

@@ -8,7 +8,7 @@ which cuts corners; here the place s on the curve is averaged, so that the motio
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from robotdiffuse.core.types import Configurations, Trajectory, spline_rows
+from robotdiffuse.core.types import Configurations, Trajectory, arc_lengths, running_means, spline_rows
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.speed_limits import (
     NO_EXTRA_LIMITS,
@@ -45,7 +45,7 @@ def time_curve(
     Velocity, acceleration and jerk limits hold at every time. Raises OutOfTimeError if the deadline leaves no
     time.
     """
-    knots = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1)))
+    knots = arc_lengths(waypoints)
     curve = CubicSpline(knots, waypoints)
     grid = np.linspace(0.0, knots[-1], GRID_INTERVALS + 1)
     velocity, acceleration = scaled_limits(robot, settings)
@@ -62,8 +62,8 @@ def time_curve(
         # average s over each window; the longer the window, the lower the jerk, and the later the end
         motions = []
         for window in jerk_windows(step, share * acceleration, jerk):
-            total = np.cumsum(np.concatenate([np.zeros(window), s, np.full(window, s[-1])]))
-            controls = curve((total[window:] - total[:-window]) / window, 0)
+            padded = np.concatenate([np.zeros(window), s, np.full(window, s[-1])])
+            controls = curve(running_means(padded, window), 0)
             controls[0] = waypoints[0]
             controls[-1] = waypoints[-1]
             motion = Trajectory(robot.joint_names, *spline_rows(controls, step))

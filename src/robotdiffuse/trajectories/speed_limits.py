@@ -207,12 +207,14 @@ def within_limits(
     return slowed(motion, max(ROUNDING_MARGIN * factor, least))
 
 
-def jerk_limits(robot: Robot, settings: TimingSettings = DEFAULT) -> JointValues:
+def jerk_limits(
+    robot: Robot, settings: TimingSettings = DEFAULT, ratio: float = DEFAULT_JERK_RATIO
+) -> JointValues:
     """The jerk limit of each joint [rad/s³] or [m/s³]: the limit of the settings, else the joint's own limit,
-    else DEFAULT_JERK_RATIO times its acceleration limit."""
+    else `ratio` times its acceleration limit."""
     if settings.jerk is not None:
         return np.full(robot.dof, settings.jerk)
-    return np.where(robot.jerk > 0, robot.jerk, DEFAULT_JERK_RATIO * robot.acceleration)
+    return np.where(robot.jerk > 0, robot.jerk, ratio * robot.acceleration)
 
 
 def _moving_start(robot: Robot, line: RoundedLine, settings: TimingSettings, start_speed: float) -> Rows:

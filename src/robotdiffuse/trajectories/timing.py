@@ -19,6 +19,7 @@ from robotdiffuse.core.types import (
     Values,
     interpolated,
     spline_rows,
+    step_lengths,
 )
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.speed_limits import (
@@ -198,7 +199,7 @@ def _check_limits(robot: Robot) -> None:
 def _distinct(positions: Configurations) -> Int[ndarray, "m"]:
     """Indices of the rows without repetitions: the first row, and each row that differs from the one returned
     before it. The last index is replaced by that of the last row. Only one index if all rows are equal."""
-    if (np.linalg.norm(positions[1:] - positions[:-1], axis=1) > SAME_WAYPOINT_DISTANCE).all():
+    if (step_lengths(positions) > SAME_WAYPOINT_DISTANCE).all():
         return np.arange(len(positions))
     distinct = [0]
     for i in range(1, len(positions)):
@@ -342,15 +343,15 @@ class StopGraph:
         # squared distances, without the term that is the same for all configurations
         return ((configurations**2).sum(axis=1) - 2 * at @ configurations.T).argmin(axis=1)
 
-    def trajectory(self, motions: list[Motion | int]) -> Trajectory:
-        """The trajectory of motions one after the other; an integer in `motions`, whatever its value,
-        is a wait of one time step."""
+    def trajectory(self, numbers: list[int]) -> Trajectory:
+        """The trajectory of motions one after the other, given by their indices in `motions`; a negative
+        index is a wait of one time step."""
         q = self.line(self.stops[:1], 0)
         segments = [(np.zeros(1), q, 0 * q, 0 * q)]  # motions begin and end without acceleration
-        for part in motions:
-            if isinstance(part, int):
+        for number in numbers:
+            if number < 0:
                 q = np.repeat(segments[-1][1][-1:], 2, axis=0)
                 segments.append((np.array([0.0, self.step]), q, 0 * q, 0 * q))
             else:
-                segments.append(part.rows)
+                segments.append(self.motions[number].rows)
         return Trajectory(self.joint_names, *joined_rows(segments))

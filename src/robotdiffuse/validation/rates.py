@@ -28,7 +28,7 @@ from robotdiffuse.core.types import JointRows, JointValues, Trajectory, Values
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.cubics import Cubics
 from robotdiffuse.validation.report import Violation
-from robotdiffuse.validation.tolerances import DEFAULT, VerifySettings
+from robotdiffuse.validation.tolerances import VerifySettings
 
 AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
 """Lengths of time over which mean accelerations are tested if any rows are closer than the first length [s].
@@ -40,7 +40,7 @@ MIN_TIME = 1e-12
 def rate_violations(
     robot: Robot,
     trajectory: Trajectory,
-    settings: VerifySettings = DEFAULT,
+    settings: VerifySettings,
     start_velocity: JointValues | None = None,
     cubics: Cubics | None = None,
 ) -> list[Violation]:
@@ -52,14 +52,13 @@ def rate_violations(
     if they have been computed.
     """
     first_violations: dict[str, Violation] = {}
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+    with np.errstate(all="ignore"):
         initial_velocity = np.zeros(robot.dof) if start_velocity is None else start_velocity
         for check in _checks(robot, cubics or Cubics(trajectory), settings, initial_velocity):
-            within = check.deviation <= check.allowed
-            if within.all():
+            wrong = ~(check.deviation <= check.allowed)
+            if not wrong.any():
                 continue
-            wrong = ~within
-            i = int(np.flatnonzero(wrong.any(axis=1))[0])
+            i = int(wrong.any(axis=1).argmax())
             beyond = np.where(wrong, np.nan_to_num(check.deviation - check.allowed, nan=np.inf), 0.0)
             j = int(beyond[i].argmax())
             time = float(trajectory.times[i])

@@ -9,7 +9,16 @@ from numpy import ndarray
 
 from robotdiffuse.core.settings import Bound, Natural, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import inverse, rotation_angle, rpy_from_rotation
-from robotdiffuse.core.types import Configuration, Configurations, JointRows, Mask, Pose, Values, interpolated
+from robotdiffuse.core.types import (
+    Configuration,
+    Configurations,
+    JointRows,
+    Mask,
+    Pose,
+    Values,
+    interpolated,
+    step_lengths,
+)
 from robotdiffuse.problems.problem import AnyGoal, Goal, JointGoal, PosesGoal, goals_of
 from robotdiffuse.robots.robot import Robot
 
@@ -100,17 +109,10 @@ def goal_error(
         poses: Cache of the poses T_base_link at q by link, which this function fills.
     """
     poses = {} if poses is None else poses
-    if isinstance(goal, AnyGoal):
-        errors = list[GoalError]()
-        for part in goal.goals:
-            error = goal_error(robot, part, q, settings, blend, poses)
-            if error is None:
-                return None
-            errors.append(error)
-        return min(errors, key=lambda error: error.excess)
-    if isinstance(goal, PosesGoal):
-        errors = [goal_error(robot, part, q, settings, blend, poses) for part in goal.poses]
-        return max((error for error in errors if error), key=lambda error: error.excess, default=None)
+    if isinstance(goal, AnyGoal | PosesGoal):
+        chosen, parts = (min, goal.goals) if isinstance(goal, AnyGoal) else (max, goal.poses)
+        errors = (goal_error(robot, part, q, settings, blend, poses) for part in parts)
+        return chosen(errors, key=lambda error: error.excess if error else -1.0)
     if isinstance(goal, JointGoal):
         differences = goal.positions - q
         differences -= robot.whole_turns(differences)
@@ -163,8 +165,8 @@ def first_place_within(
     goal: Goal,
     q: Configurations,
     blend: float,
-    settings: VerifySettings = DEFAULT,
-    after: float = 0.0,
+    settings: VerifySettings,
+    after: float,
 ) -> float | None:
     """The first place from `after` on where a path through configurations is within `blend` of a goal.
 
@@ -181,7 +183,7 @@ def first_place_within(
 def sample_path(q: Configurations, step: float, after: float = 0.0) -> tuple[Values, JointRows]:
     """Places on a path from `after` on, at most `step` apart [rad, joint-space L2], and the configurations
     there. A place is the index of a row plus the traveled fraction of the segment after it."""
-    steps = np.linalg.norm(np.diff(q, axis=0), axis=1)
+    steps = step_lengths(q)
     counts = np.maximum(np.ceil(steps / step), 1).astype(int)
     shares = [np.arange(count) / count for count in counts]
     places = np.append(np.repeat(np.arange(len(counts)), counts) + np.concatenate([[], *shares]), len(counts))

@@ -13,7 +13,7 @@ the values in between. If such a bound exceeds the limit, the piece is halved.
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -31,7 +31,15 @@ from robotdiffuse.core.errors import (
     within,
 )
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.types import ROWS, Configurations, JointRows, Path, Trajectory, Values, for_kernels
+from robotdiffuse.core.types import (
+    Configurations,
+    JointRows,
+    Path,
+    Trajectory,
+    Values,
+    array_names,
+    for_kernels,
+)
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.dynamics import Dynamics, Stretches
 from robotdiffuse.robots.robot import check_joints
@@ -246,12 +254,12 @@ def verify_trajectory(problem: Problem, trajectory: Trajectory, settings: Verify
     return verify(problem, trajectory, settings)
 
 
-def check_motion(what: str, motion: object, kinds: tuple[type, ...]) -> None:
+def check_motion(what: str, motion: Any, kinds: tuple[type, ...]) -> None:
     """Raise InputError, naming `what`, unless `motion` is an instance of `kinds` with arrays of numbers."""
     descriptions = {Path: "a Path, e.g. result.path", Trajectory: "a Trajectory, e.g. result.trajectory"}
     check_type(what, motion, kinds, ", or ".join(descriptions[kind] for kind in kinds))
-    check_type(f"{what}.joint_names", motion.joint_names, (tuple, list), "a tuple of names")  # type: ignore
-    for name in ("positions", *(("times", *ROWS[1:]) if isinstance(motion, Trajectory) else ())):
+    check_type(f"{what}.joint_names", motion.joint_names, (tuple, list), "a tuple of names")
+    for name in array_names(motion):
         values = getattr(motion, name)
         if not isinstance(values, ndarray) or values.dtype.kind not in "iuf":
             raise InputError(f"{what}.{name} is {shown(values)}; it must be a NumPy array of numbers")
@@ -372,13 +380,12 @@ class Verifier:
         known. at_rest: whether the motion rests at each row; None: it may stop at any row. along: times and
         configurations of a finer path, on which path constraints are proved; None: `times` and `q`.
         """
-        bad = np.flatnonzero(~(np.abs(q) <= MAX_COORDINATE).all(axis=1))
-        if len(bad):
-            at = float(bad[0] if times is None else times[bad[0]])
-            row = q[bad[0]]
-            j = int((~(np.abs(row) <= MAX_COORDINATE)).argmax())
+        wrong = ~(np.abs(q) <= MAX_COORDINATE)
+        if wrong.any():
+            i, j = np.argwhere(wrong)[0]
+            at = float(i if times is None else times[i])
             rule = f"it must be a finite number within ±{MAX_COORDINATE:g}"
-            message = f"{self.robot.joint_names[j]} is {row[j]:g} at waypoint {bad[0]}; {rule}"
+            message = f"{self.robot.joint_names[j]} is {q[i, j]:g} at waypoint {i}; {rule}"
             return Report(False, Violation("not_finite", at, message), None, None)
         clock = np.arange(len(q), dtype=float) if times is None else times
         limits = self._limits(q, clock, "waypoint {:g}" if times is None else "{:.3f} s")
@@ -394,21 +401,21 @@ class Verifier:
         first = min(found, key=lambda violation: violation.time, default=None)
         last = len(q) - 1 if first is None else int(np.searchsorted(clock, first.time))
         sweep = self._continuous.sweep(q[: last + 1])
-        collision = None
-        moving = None
+        scene = sweep.scene_clearance
+        candidates = [first]
+        if sweep.contact is not None:
+            candidates.append(collision_violation(sweep.contact, clock))
         if times is not None and self.problem.moving:
             moving = self._moving.sweep(times[: last + 1], q[: last + 1])
-        if sweep.contact is not None:
-            collision = collision_violation(sweep.contact, _time_at(sweep.contact.at, clock))
-        ends = (self._waypoints(q, clock, at_rest), self._goal(q[-1], float(clock[-1])))
-        hit = None if moving is None or moving.contact is None else _moving_contact_violation(moving.contact)
-        earliest = [v for v in (first, collision, hit, *ends) if v is not None]
-        violation = min(earliest, key=lambda v: v.time, default=None)
-        valid = violation is None
-        scene, itself = (sweep.scene_clearance, sweep.self_clearance) if valid else (None, None)
-        if scene is not None and moving is not None:
             scene = min(scene, moving.clearance)
-        return Report(valid, violation, scene, itself, found=tuple(dict.fromkeys((*found, *earliest))))
+            if moving.contact is not None:
+                candidates.append(_moving_contact_violation(moving.contact))
+        candidates += [self._waypoints(q, clock, at_rest), self._goal(q[-1], float(clock[-1]))]
+        earliest = [v for v in candidates if v is not None]
+        violation = min(earliest, key=lambda v: v.time, default=None)
+        found = tuple(dict.fromkeys((*found, *earliest)))
+        clearances = (scene, sweep.self_clearance) if violation is None else (None, None)
+        return Report(violation is None, violation, *clearances, found=found)
 
     def _start(self, q: ndarray) -> Violation | None:
         difference = np.abs(q[0] - self.problem.start)
@@ -425,10 +432,9 @@ class Verifier:
         """A violation if a continuous joint turns by nearly a whole turn in one step, probably because its
         values were wrapped."""
         turns = self.robot.wraps(q)
-        wrapped = np.flatnonzero(turns.any(axis=1))
-        if not len(wrapped):
+        if not turns.any():
             return None
-        i = int(wrapped[0])
+        i = int(turns.any(axis=1).argmax())
         j = int(np.abs(turns[i]).argmax())
         name = self.robot.joint_names[j]
         step = float(q[i + 1, j] - q[i, j])
@@ -440,11 +446,11 @@ class Verifier:
 
     def _limits(self, q: ndarray, clock: ndarray, place: str) -> Violation | None:
         excess = self.robot.limit_excess(q)
-        bad = np.flatnonzero((excess > self.settings.limit_slack).any(axis=1))
-        if not len(bad):
+        beyond = (excess > self.settings.limit_slack).any(axis=1)
+        if not beyond.any():
             return None
-        i = int(bad[0])
-        j = int(excess[bad[0]].argmax())
+        i = int(beyond.argmax())
+        j = int(excess[i].argmax())
         name = self.robot.joint_names[j]
         at = place.format(clock[i])
         value, low, high = distinct(q[i, j], self.robot.lower[j], self.robot.upper[j])
@@ -603,11 +609,9 @@ def _spaced_rows(q, step):
     return row_indices[:count]
 
 
-@lru_cache(maxsize=8)
-def verifier(problem: Problem, settings: VerifySettings = DEFAULT) -> Verifier:
-    """The Verifier of a problem. The last eight are cached, so that data of the robot and the scene is
-    prepared once for many paths of a problem."""
-    return Verifier(problem, settings)
+verifier = lru_cache(maxsize=8)(Verifier)
+"""The Verifier of a problem. The last eight are cached, so that data of the robot and the scene is prepared
+once for many paths of a problem."""
 
 
 def _time_at(place: float, clock: ndarray) -> float:
@@ -633,19 +637,17 @@ def _unusable(trajectory: Trajectory) -> Violation | None:
 
 
 def _moving_contact_violation(contact: "TimedContact") -> Violation:
-    link = contact.link
-    obstacle = contact.obstacle
-    time = contact.time
-    message = f"{describe_contact(link, obstacle, contact.depth, False)} at {time:.3f} s"
-    return Violation("scene_collision", time, message, link, obstacle, contact.depth)
+    link, obstacle, time, depth = contact
+    message = f"{describe_contact(link, obstacle, depth, False)} at {time:.3f} s"
+    return Violation("scene_collision", time, message, link, obstacle, depth)
 
 
-def collision_violation(contact: Contact, time: float) -> Violation:
-    """The violation for a contact at a time."""
-    (link, pair), partner = contact.check, contact.other
+def collision_violation(contact: Contact, clock: ndarray) -> Violation:
+    """The violation for a contact of a motion with rows at the times `clock`."""
+    (link, pair), partner, at, depth = contact
     kind = "scene_collision" if pair is None else "self_collision"
-    message = describe_contact(link, partner, contact.depth, pair is not None)
-    return Violation(kind, time, message, link, partner, contact.depth)
+    message = describe_contact(link, partner, depth, pair is not None)
+    return Violation(kind, _time_at(at, clock), message, link, partner, depth)
 
 
 def violations(
@@ -662,8 +664,10 @@ def violations(
     not those of a motion, only this is returned.
     """
     report = verify(problem, motion, settings)
-    if report.valid or (report.violation is not None and report.violation.kind in ("not_finite", "time")):
-        return () if report.violation is None else (report.violation,)
+    if report.valid:
+        return ()
+    if report.violation.kind in ("not_finite", "time"):
+        return (report.violation,)
     # contacts with static obstacles and links, and joint limits, are left to the complete searches below
     static = {*(shape.name for shape in problem.scene.shapes), *problem.robot.link_names}
     all_violations = [
@@ -677,7 +681,7 @@ def violations(
         wrong_rates = any(wrong.kind in RATE_KINDS for wrong in all_violations)
         clock, q = (motion.times, q) if wrong_rates else cubics.sampled(settings.chord)[:2]
     for contact in contacts(problem.robot, problem.scene, q, settings.contact):
-        all_violations.append(collision_violation(contact, _time_at(contact.at, clock)))
+        all_violations.append(collision_violation(contact, clock))
     # `verify` may use a finer chord, and so find a contact that the search along these lines misses
     listed = {(w.kind, w.subject, w.other) for w in all_violations}
     all_violations += [

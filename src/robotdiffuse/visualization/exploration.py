@@ -4,7 +4,6 @@ A step of the kind `look` moves the arm to take a view with its camera.
 """
 
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -14,7 +13,7 @@ from PIL import Image
 
 from robotdiffuse.core.files import JsonObject, check_output, write_atomically
 from robotdiffuse.core.transforms import placed
-from robotdiffuse.core.types import Mask, Path, Points, Trajectory
+from robotdiffuse.core.types import Mask, Path, Points, Trajectory, frozen_dataclass
 from robotdiffuse.drawables import ASSUMED, OBSERVED, Color, Surface, drawables, painted
 from robotdiffuse.perception.seen_points import near_scene
 from robotdiffuse.perception.voxel_grid import MAP
@@ -27,6 +26,7 @@ from robotdiffuse.visualization.picture import (
     Camera,
     ClearSurface,
     DrawnArm,
+    Facts,
     PictureSettings,
     caption,
     faded_below,
@@ -71,7 +71,7 @@ LAYERS = (
 Voxels = Bool[ndarray, "nx ny nz"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Moment:
     """A step of the exploration, and what was known about the scene when it was chosen and during its
     motion."""
@@ -89,7 +89,7 @@ class Moment:
         return self.views[0]
 
 
-def shares(known: RecordedView) -> list[tuple[str, str]]:
+def shares(known: RecordedView) -> Facts:
     """Labels and values of the fractions of the map that were seen free, and unknown."""
     parts = (("seen free", known.free), ("unknown", known.unknown))
     return [(name, f"{100 * voxels.mean():.0f} %") for name, voxels in parts]

@@ -17,6 +17,7 @@ from robotdiffuse.collision.exact_meshes import forward_frames
 from robotdiffuse.core.errors import InputError, check_type, joined
 from robotdiffuse.core.files import check_output, write_atomically
 from robotdiffuse.core.settings import Bound, Natural, NotNegative, Settings
+from robotdiffuse.core.transforms import ball_around
 from robotdiffuse.core.types import (
     Configuration,
     Configurations,
@@ -27,7 +28,10 @@ from robotdiffuse.core.types import (
     Trajectory,
     Values,
     Vector,
+    arc_lengths,
+    frozen_dataclass,
     interpolated,
+    step_lengths,
 )
 from robotdiffuse.drawables import (
     GOAL,
@@ -96,7 +100,7 @@ class DrawnArm:
 def dense(q: Configurations) -> Configurations:
     """TRACE_POINTS configurations, equally spaced along a path in joint space; one configuration if the path
     has no length."""
-    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(q, axis=0), axis=1))])
+    s = arc_lengths(q)
     return q[:1] if s[-1] == 0 else interpolated(np.linspace(0, s[-1], TRACE_POINTS), s, q)
 
 
@@ -104,7 +108,7 @@ def timed(motion: Path | Trajectory) -> tuple[Values, Configurations]:
     """Times [s] and positions of a motion; a path without times gets a constant speed in joint space."""
     if isinstance(motion, Trajectory):
         return motion.times, motion.positions
-    steps = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1) / UNTIMED_SPEED
+    steps = step_lengths(motion.positions) / UNTIMED_SPEED
     return np.concatenate([[0.0], np.cumsum(steps)]), motion.positions
 
 
@@ -118,21 +122,21 @@ def check_motion_of(robot: Robot, motion: Path | Trajectory) -> None:
         raise InputError("the motion has positions that are not finite")
 
 
-def facts(
-    motion: Path | Trajectory, result: PlanResult | None, robot: Robot | None = None
-) -> list[tuple[str, str]]:
+Facts = list[tuple[str, str]]
+"""Labels and values, for headers and captions."""
+
+
+def facts(motion: Path | Trajectory, result: PlanResult | None, robot: Robot | None = None) -> Facts:
     """Labels and values of facts about a motion, for headers and captions. With `robot`, one of them says
     that the arm is drawn by its collision geometry, if no visual meshes of this robot are bundled."""
-    length = result.path_length if result is not None else None
-    if length is None:
-        length = Path(motion.joint_names, motion.positions).length
+    path = getattr(result, "path", None) or Path(motion.joint_names, motion.positions)
     rows = []
     if result is not None:
         rows.append(("status", result.status.value.replace("_", " ")))
         same_planner = result.stage in ("", result.planner)
         rows.append(("planner", result.planner if same_planner else f"{result.planner} · {result.stage}"))
         rows.append(("planning time", f"{1e3 * result.planning_time:.0f} ms"))
-    rows.append(("path length", f"{length:.2f} rad"))
+    rows.append(("path length", f"{path.length:.2f} rad"))
     if result is not None and result.min_clearance is not None:
         rows.append(("clearance", f"{result.min_clearance * 1e3:.1f} mm"))
     if result is not None and result.confidence is not None:
@@ -155,7 +159,7 @@ MAX_FRAMING_DISTANCE = 1.3
 """The view is framed to include obstacles up to this distance from the middle of the motion [m]."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Camera:
     """A pinhole camera that looks at `target`, with z up."""
 
@@ -215,7 +219,7 @@ def framed(
 
     `size` is width and height [pixels]; `free` are the fractions of the height to leave free above and below.
     """
-    target = 0.5 * (points.min(0) + points.max(0))
+    target, _ = ball_around(points)
     distance = 1.0
     # borders of the part of the picture that is not left free, as coordinates at depth 1
     tangent = np.tan(VERTICAL_FIELD / 2)
@@ -254,7 +258,7 @@ def view_of_motion(
     obstacles = join([obstacle.surface for obstacle in among])
     owners = np.repeat(np.arange(len(among)), [len(obstacle.surface.faces) for obstacle in among])
     moving = np.concatenate([goal.vertices, ghosts.vertices, trace])
-    middle = 0.5 * (moving.min(0) + moving.max(0))
+    middle, _ = ball_around(moving)
     near = np.linalg.norm(obstacles.vertices - middle, axis=1) < MAX_FRAMING_DISTANCE
     points = np.concatenate([moving, obstacles.vertices[near]])
     # the corners of the convex hull determine the frame
@@ -309,7 +313,7 @@ def _score(
     column = column.clip(0, camera.width - 1)
     row = row.clip(0, camera.height - 1)
     visible = inside & (pixels[:, 2] > obstacle_nearness[row, column])
-    steps = np.linalg.norm(np.diff(pixels[:, :2], axis=0), axis=1)
+    steps = step_lengths(pixels[:, :2])
     return score + float(steps[visible[1:]].sum()) / camera.height
 
 
@@ -343,7 +347,7 @@ MARGINS = (0.05, 0.11)
 """Fractions of the height left free above the arm, and below it for the caption."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class ClearSurface:
     """A see-through surface. Only its part nearest to the camera is drawn."""
 
@@ -379,7 +383,7 @@ def write_picture(
     *,
     result: PlanResult | None = None,
     title: str | None = None,
-    settings: PictureSettings | None = None,
+    settings: PictureSettings = PictureSettings(),
     moving: Sequence[MovingObstacle] = (),
 ) -> None:
     """Write a picture of a motion as .png.
@@ -389,7 +393,6 @@ def write_picture(
     to the caption. Raises InputError for a file name with another ending, or a file that cannot be written.
     """
     path = check_output(file, (".png",))
-    settings = settings or PictureSettings()
     pixels = render(robot, scene, motion, settings, moving=moving)
     write_captioned(pixels, path, title or robot.name, facts(motion, result, robot))
 
@@ -401,7 +404,7 @@ def write_comparison(
     file: str | FilePath,
     *,
     title: str | None = None,
-    settings: PictureSettings | None = None,
+    settings: PictureSettings = PictureSettings(),
     moving: Sequence[MovingObstacle] = (),
 ) -> None:
     """Write a picture of several motions of one arm in one scene as .png. `motions` are given by name.
@@ -413,7 +416,7 @@ def write_comparison(
     if not 0 < len(motions) <= len(COMPARED):
         raise InputError(f"{len(motions)} motions; a picture shows 1 to {len(COMPARED)}")
     first, *other_motions = motions.values()
-    pixels = render(robot, scene, first, settings or PictureSettings(), others=other_motions, moving=moving)
+    pixels = render(robot, scene, first, settings, others=other_motions, moving=moving)
     # without labels, "untimed" (see `facts`) would say nothing
     figures = [", ".join(v for k, v in facts(m, None) if v != "untimed") for m in motions.values()]
     captions = list(zip(motions, figures, strict=True))
@@ -424,7 +427,7 @@ def write_captioned(
     pixels: np.ndarray,
     path: FilePath,
     title: str,
-    facts: list[tuple[str, str]],
+    facts: Facts,
     colors: Sequence[Color] = (),
 ) -> None:
     """Write a picture with its caption; see `caption`."""
@@ -650,7 +653,7 @@ def faded_below(pixels: np.ndarray, begin: float = 0.84, most: float = 0.8) -> n
 def caption(
     image: Image.Image,
     title: str,
-    facts: list[tuple[str, str]],
+    facts: Facts,
     colors: Sequence[Color] = (),
     enlarged: float = 1.0,
 ) -> None:

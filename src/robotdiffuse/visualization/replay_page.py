@@ -9,7 +9,6 @@ import json
 import re
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from robotdiffuse.core.errors import InputError, check_type, shortened
+from robotdiffuse.core.errors import InputError, check_type, counted, shortened
 from robotdiffuse.core.files import JsonObject, check_output, write_atomically
 from robotdiffuse.core.transforms import IDENTITY, inverse, moved_spheres, quaternion_from_rotation
 from robotdiffuse.core.types import (
@@ -31,6 +30,7 @@ from robotdiffuse.core.types import (
     ResultFile,
     Trajectory,
     Values,
+    frozen_dataclass,
     interpolated,
 )
 from robotdiffuse.drawables import (
@@ -103,8 +103,7 @@ def write_replay(
     or a file that cannot be written.
     """
     target = check_output(file, (".html", ".htm"))
-    count = len(scene.shapes) + len(moving)
-    title = title or f"{robot.name} · {count} obstacle{'' if count == 1 else 's'}"
+    title = title or f"{robot.name} · {counted(len(scene.shapes) + len(moving), 'obstacle')}"
     write_atomically(target, page_text(title, page_data(robot, scene, motion, result, moving)))
 
 
@@ -112,18 +111,20 @@ def page_text(title: str, data: JsonObject, script: str = "") -> str:
     """The HTML text of a page with the data of `page_data`. `script` is the name of a file in the folder
     `page` that runs after `replay.js`."""
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
-    page = files("robotdiffuse.visualization") / "page"
+
+    def content(name: str) -> str:
+        return (files("robotdiffuse.visualization") / "page" / name).read_text("utf-8")
+
     parts = {
         "title": html.escape(title),
-        "style": (page / "replay.css").read_text("utf-8"),
+        "style": content("replay.css"),
         # in JSON '<' occurs only in strings; escaped, it cannot end the script element
         "data": text.replace("<", "\\u003c"),
-        "three": (page / "three.min.js").read_text("utf-8"),
-        "script": (page / "replay.js").read_text("utf-8"),
-        "more": (page / script).read_text("utf-8") if script else "",
+        "three": content("three.min.js"),
+        "script": content("replay.js"),
+        "more": content(script) if script else "",
     }
-    template = (page / "replay.html").read_text("utf-8")
-    return _filled(template, parts)
+    return _filled(content("replay.html"), parts)
 
 
 def _filled(template: str, parts: dict[str, str]) -> str:
@@ -200,7 +201,7 @@ def _track(obstacle: Drawable, motion: Path | Trajectory) -> list[list[float]]:
     rows = []
     for time in np.linspace(0.0, motion.duration, count):
         T = obstacle.frame(time) @ T_shape_base
-        rows.append(_rounded(np.concatenate([T[:3, 3], quaternion_from_rotation(T[:3, :3])]), 6))
+        rows.append(_rounded(np.concatenate([T[:3, 3], quaternion_from_rotation(T)]), 6))
     return rows
 
 
@@ -302,8 +303,8 @@ def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | N
     goal_configuration, validity = _goal_state(problem)
     validities = {"start": problem.is_free(problem.start), "goal": validity}
     states = np.stack([problem.start] if goal_configuration is None else [problem.start, goal_configuration])
-    scene = added(problem.scene, (moving.shape for moving in problem.moving))
-    robot, scene = replace(problem, scene=scene, moving=()).robot_and_scene_in_world()
+    robot, scene = problem.robot_and_scene_in_world()
+    scene = added(scene, (moving.shape for moving in problem.moving_in_world))
     T_world_base = IDENTITY if problem.T_world_base is None else problem.T_world_base
     poses = (pose for goal in goals_of(problem.goal) for pose in poses_of(goal))
     T_world_poses = [T_world_base @ pose.T_base_frame for pose in poses]
@@ -357,10 +358,8 @@ def _colliding_links(
     marks = []
     # not strict: if no configuration reaches the goal, `states` has only the start
     for q, validity in zip(states, validities, strict=False):
-        T_base_frame = arm.frames(q)
         for link in validity.links:
-            T_base_link = T_base_frame[robot.link_frame(link)] @ robot.T_frame_link(link)
-            marks.append((_raised(links[link]).moved(T_base_link), COLLIDING))
+            marks.append((_raised(links[link]).moved(robot.fk(q, link)), COLLIDING))
     return marks
 
 
@@ -443,7 +442,7 @@ show(0, false);
 """
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class GalleryEntry:
     """A motion in a gallery, with its scene."""
 

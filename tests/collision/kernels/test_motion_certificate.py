@@ -79,11 +79,9 @@ def test_planes_part_as_far_as_coal_says(name: str, seed: int) -> None:
     convex_bounds.pose(robot.frame_offsets.copy(), robot.kernel_parents, slides, q, np.zeros(robot.dof), posture)
     for found in exact.link_distances(q):
         guess = rng.normal(size=3)
-        planes = [
-            convex_bounds.best_plane(arm, p, arrays, o, 0, np.inf, guess / np.linalg.norm(guess), posture)
-            for p in parts[found.link]
-            for o in range(len(scene.shapes))
-        ]
+        guess /= np.linalg.norm(guess)
+        pairs = [(part, obstacle) for part in parts[found.link] for obstacle in range(len(scene.shapes))]
+        planes = [convex_bounds.best_plane(arm, p, arrays, o, 0, np.inf, guess, posture) for p, o in pairs]
         least = min(middle for middle, _, _ in planes)
         assert all(middle == along or middle == -np.inf for middle, along, _ in planes)
         assert least <= found.distance + 1e-6

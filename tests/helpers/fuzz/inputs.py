@@ -178,12 +178,7 @@ def _moveit(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     scene, request = (yaml_text(rng, data, i) for i, data in enumerate((examples.MOVEIT, asked)))
     (folder / "scene0001.yaml").write_bytes(scene)
     (folder / "request0001.yaml").write_bytes(request)
-
-    def read() -> None:
-        [entry] = load_motion_bench_maker(folder)
-        entry.load()
-
-    return read
+    return lambda: load_motion_bench_maker(folder)[0].load()
 
 
 def yaml_text(rng: np.random.Generator, data: Any, other: int) -> bytes:
@@ -217,9 +212,8 @@ def _urdf(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     which = rng.integers(4)
     files["two.urdf"].write_bytes(numbers_changed(rng, examples.URDF) if which < 2 else examples.URDF)
     files["two.srdf"].write_bytes(numbers_changed(rng, examples.SRDF) if which == 2 else examples.SRDF)
-    files["limits.yaml"].write_bytes(
-        text_of(rng, examples.LIMITS, ".yaml") if which == 3 else json.dumps(examples.LIMITS).encode()
-    )
+    limits = text_of(rng, examples.LIMITS, ".yaml") if which == 3 else json.dumps(examples.LIMITS).encode()
+    files["limits.yaml"].write_bytes(limits)
 
     def read() -> None:
         srdf = read_srdf(files["two.srdf"])
@@ -232,23 +226,11 @@ def _urdf(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
 
 
 def _result(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
-    record = {
-        "status": "solved",
-        "reason": "solved by hand",
-        "planner": "hand",
-        "robot": "panda",
-        "joint_names": examples.JOINTS,
-        "planning_time": 0.1,
-        "verified": True,
-        "seed": 0,
-        "waypoints": examples.ROWS,
-        "times": [0.0, 1.0, 2.0],
-        "positions": examples.ROWS,
-        "velocities": [[0.0] * 7, [0.3] + [0.0] * 6, [0.0] * 7],
-        "accelerations": [[0.0] * 7] * 3,
-        "progress": [[0.1, 0.4]],
-        "problem": examples.SMALL,
-    }
+    record: dict[str, Any] = {"status": "solved", "reason": "solved by hand", "planner": "hand", "robot": "panda"}
+    record |= {"joint_names": examples.JOINTS, "planning_time": 0.1, "verified": True, "seed": 0, "waypoints": examples.ROWS}
+    record |= {"times": [0.0, 1.0, 2.0], "positions": examples.ROWS}
+    record |= {"velocities": [[0.0] * 7, [0.3] + [0.0] * 6, [0.0] * 7], "accelerations": [[0.0] * 7] * 3}
+    record |= {"progress": [[0.1, 0.4]], "problem": examples.SMALL}
     file = folder / "result.json"
     file.write_bytes(text_of(rng, record, ".json"))
 
@@ -396,9 +378,8 @@ def _depth(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     view = examples.VIEW | {"depth": file.name, "intrinsics": [6.0, 6.0, 4, 3], "scale": 0.001}
     del view["cloud"]
     problem = examples.SMALL | {"views": [view], "unknown": "padded"}
-    (folder / "problem.json").write_bytes(
-        text_of(rng, problem, ".json") if rng.random() < 0.5 else json.dumps(problem).encode()
-    )
+    content = text_of(rng, problem, ".json") if rng.random() < 0.5 else json.dumps(problem).encode()
+    (folder / "problem.json").write_bytes(content)
     return lambda: _validated(folder / "problem.json")
 
 
@@ -464,8 +445,7 @@ def _npz(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     from robotdiffuse.datasets.external import import_npz
 
     stream = io.BytesIO()
-    x = np.zeros((2, 254, 7), np.float32)
-    x += np.array(examples.PROBLEM["start"], np.float32)
+    x = np.zeros((2, 254, 7), np.float32) + np.array(examples.PROBLEM["start"], np.float32)
     y = np.concatenate([x[:, 0], x[:, -1], np.ones((2, 9), np.float32)], axis=1)
     if rng.random() < 0.3:
         y[0, rng.integers(y.shape[1])] = (np.nan, 1e30, np.inf)[rng.integers(3)]

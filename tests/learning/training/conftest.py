@@ -37,8 +37,7 @@ def stored(tmp_path_factory):
         s = np.linspace(0, 1, STORED)[:, None]
         q = ends[0] * (1 - s) + ends[1] * s + 0.5 * side[:, None, None] * np.sin(np.pi * s)
         arrays = random_arrays(arm, n, rng)
-        kinds = np.zeros_like(arrays["obstacle_kinds"])
-        params = np.zeros_like(arrays["obstacle_params"])
+        kinds, params = (np.zeros_like(arrays[name]) for name in ("obstacle_kinds", "obstacle_params"))
         kinds[:, 0] = SPHERE
         params[:, 0, :4] = np.stack([0.01 * rng.random(n), 0.5 * side, 0 * side + 1, 0 * side + 0.2], -1)
         arrays |= {"trajectories": q, "obstacle_kinds": kinds, "obstacle_params": params}

@@ -27,9 +27,8 @@ def test_codes_are_cached_beside_the_data(data, arm):
 
 def test_turned_copies_are_for_training_alone(data, arm):
     encoder = load_encoder(data.parent / "encoder")
-    messages = []
-    plain = load_data(str(data), arm, encoder, WAYPOINTS, messages.append)
-    turned = load_data(str(data), arm, encoder, WAYPOINTS, messages.append, turned_copies=2)
+    plain = load_data(str(data), arm, encoder, WAYPOINTS, print)
+    turned = load_data(str(data), arm, encoder, WAYPOINTS, print, turned_copies=2)
     assert turned.validation == plain.validation and len(turned) > len(plain)
     for split, more in zip(plain.split(10**6), turned.split(10**6), strict=True):
         apart = np.abs(split.q[:, None, :, 1:] - more.q[None, :, :, 1:]).max((2, 3))
@@ -40,8 +39,7 @@ def test_turned_copies_are_for_training_alone(data, arm):
 def test_splits_and_waypoints(data, arm):
     loaded = load_data(str(data), arm, load_encoder(data.parent / "encoder"), WAYPOINTS, print)
     train, validation = loaded.split(1000)
-    assert set(split_of(train.scenes)) == {0}
-    assert set(split_of(validation.scenes)) == {1}
+    assert set(split_of(train.scenes)) == {0} and set(split_of(validation.scenes)) == {1}
     assert 120 < len(train) + len(validation) == len(loaded) < 160
     assert len(loaded.split(2)[1]) == 2 and train.q.shape[1:] == (WAYPOINTS, arm.dof)
 

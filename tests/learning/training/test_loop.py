@@ -21,8 +21,7 @@ def test_losses_that_are_not_finite_are_skipped(tmp_path: Path) -> None:
     run = run_of(tmp_path, lambda call: float("nan") if call in (4, 10, 11) else 1.0)
     run.loop()
     assert all(torch.isfinite(parameter).all() for parameter in run.module.parameters())
-    assert (run.at.samples, run.at.skipped) == (40, 3)
-    assert int(read_log(tmp_path)[-1]["skipped"]) == 3
+    assert (run.at.samples, run.at.skipped) == (40, 3) and int(read_log(tmp_path)[-1]["skipped"]) == 3
     refuses("not finite", run_of(tmp_path / "hopeless", lambda call: float("nan")).loop)
 
 

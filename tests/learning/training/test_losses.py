@@ -62,11 +62,8 @@ def test_surface_points_move_with_their_links() -> None:
     links = [link for link, meshes in PANDA.meshes.items() if meshes and PANDA.link_frame(link) > 0]
     assert placed.shape == (2, 4, 3 * len(links), 3)
     for i, link in enumerate(links):
-        locals_ = []
-        for a in range(2):
-            for b in range(4):
-                T = PANDA.fk(q[a, b].numpy(), link)
-                locals_.append((placed[a, b, 3 * i : 3 * i + 3] - T[:3, 3]) @ T[:3, :3])
+        T = PANDA.fk(q.reshape(-1, 7).numpy(), link)
+        locals_ = (placed[:, :, 3 * i : 3 * i + 3].reshape(8, 3, 3) - T[:, None, :3, 3]) @ T[:, :3, :3]
         np.testing.assert_allclose(locals_, np.broadcast_to(locals_[0], (8, 3, 3)), atol=1e-9)
         corners = np.concatenate([mesh.vertices for mesh in PANDA.meshes[link]])
         assert (locals_[0] >= corners.min(0) - 1e-9).all() and (locals_[0] <= corners.max(0) + 1e-9).all()

@@ -23,7 +23,7 @@ from robotdiffuse.learning.denoisers import DENOISERS, TransformerSettings, UNet
 from robotdiffuse.learning.diffusion import OBJECTIVES
 from robotdiffuse.learning.encoders import make_encoder
 from robotdiffuse.learning.exported_model import exported_model
-from robotdiffuse.learning.motion_model import SamplingSettings
+from robotdiffuse.learning.motion_model import SamplingSettings, link_clearances
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.training import loop as training_run, tasks as training
 from robotdiffuse.learning.training.batches import Batch, Batches, fast_bf16, load_data
@@ -62,8 +62,7 @@ def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
     assert run.returncode == 0, said
     assert said.count("model: 100.0%, 160 samples") == 2, "the first process alone reports"
     first, second = json.loads((out / "seen.json").read_text())
-    assert first == second and first["report"] == first["again"]
-    assert first["skipped"] == 1 and first["samples"] == 20
+    assert first == second and first["report"] == first["again"] and first["skipped"] == 1 and first["samples"] == 20
     files = [out / part / "model.safetensors" for part in ("whole", "parts")]
     assert files[0].read_bytes() == files[1].read_bytes()
     refuses("processes = '2', not '1'", train_planner, settings, str(out / "parts"))
@@ -110,8 +109,7 @@ def test_losses_are_computed_where_the_model_is(denoiser, data, arm):
     model = model.to("meta")
     loss = training.PlannerLoss(model, arm, settings, elsewhere)(batch, 1.0, rng, torch.arange(4) > 1)
     loss.backward()
-    assert loss.device.type == "meta"
-    assert all(p.grad is not None for p in model.denoiser.parameters())
+    assert loss.device.type == "meta" and all(p.grad is not None for p in model.denoiser.parameters())
 
 
 def test_device_is_checked(data, tmp_path, monkeypatch):
@@ -175,8 +173,7 @@ def test_every_choice_trains_and_plans(changes, tmp_path, data, arm, monkeypatch
     model = exported_model("model", out, arm)
     settings = SamplingSettings(samples=3, sampling_steps=8)
     q = model.sample(START, GOAL, model.encode(np.zeros((0, 3))), nothing_near, np.random.default_rng(0), settings)
-    assert q.shape == (3, WAYPOINTS, 3) and np.isfinite(q).all()
-    assert (q[:, 0] == START).all() and (q[:, -1] == GOAL).all()
+    assert q.shape == (3, WAYPOINTS, 3) and np.isfinite(q).all() and (q[:, 0] == START).all() and (q[:, -1] == GOAL).all()
     assert (q >= arm.lower).all() and (q <= arm.upper).all()
 
 
@@ -191,8 +188,7 @@ def test_errors_in_the_workspace_have_the_same_weight_for_every_objective(data, 
     levels = np.arange(1, model.schedule.steps + 1)
     batch = batches.at(np.zeros(len(levels), np.int64), levels, np.random.default_rng(0))
     of_clean = model.schedule.weight(levels, 5.0)
-    assert (batch.clean_weight > 0).all()
-    assert (batch.clean_weight <= of_clean * (1 + 1e-5)).all()
+    assert (batch.clean_weight > 0).all() and (batch.clean_weight <= of_clean * (1 + 1e-5)).all()
     if objective == "clean":
         np.testing.assert_allclose(batch.clean_weight, of_clean, rtol=1e-6)
 
@@ -214,11 +210,7 @@ def test_planner_learns_which_side(tmp_path, data, arm):
     for side in (-1.0, 1.0):
         scene = rd.Scene([rd.Box([0, 0, -0.05], [2, 2, 0.1]), rd.Sphere([0.0, 0.5 * side, 1.0], 0.2)])
         z = model.encode(sample_surface(scene, 256, rng))
-        checker = CollisionChecker(arm, scene)
-
-        def clearances(q, checker=checker):
-            return checker.link_clearances(q.reshape(-1, 3)).reshape(*q.shape[:2], 3)
-
+        clearances = link_clearances(CollisionChecker(arm, scene), model.settings)
         q = model.sample(START, GOAL, z, clearances, rng, SamplingSettings(samples=4))
         bow = q[:, WAYPOINTS // 2] - (START + GOAL) / 2
         assert (bow * side > 0.1).all()

@@ -40,8 +40,7 @@ def test_motion_is_certified_in_time(obstacle: rd.MovingObstacle, jerk: float | 
     found = planner.plan(task, 10.0, jerk=jerk)
     assert found.status is rd.Status.SOLVED, found.reason
     assert found.trajectory is not None and rd.verify(task, found.trajectory).valid
-    assert found.scene_clearance is not None
-    assert 0 < found.scene_clearance <= min(clearances(found.trajectory, obstacle)) + 1e-9
+    assert found.scene_clearance is not None and 0 < found.scene_clearance <= min(clearances(found.trajectory, obstacle)) + 1e-9
 
 
 def test_a_start_that_is_hit_at_once_is_invalid_and_a_wall_that_comes_cannot_be_passed() -> None:
@@ -124,8 +123,7 @@ def test_each_row_of_a_path_through_waypoints_has_its_corner_deviation() -> None
     mid = rd.load_planner("aorrtc").plan(tight, 10.0)
     task = replace(tight, waypoints=[mid.trajectory.positions[len(mid.trajectory.times) // 3]])
     found = rd.load_planner("aorrtc").plan(task, 10.0)
-    assert found.corner_deviations is not None
-    assert len(found.corner_deviations) == len(found.path.positions)
+    assert found.corner_deviations is not None and len(found.corner_deviations) == len(found.path.positions)
     there = np.abs(found.path.positions - task.waypoints[0].positions[0]).max(axis=1) < 1e-6  # type: ignore[union-attr]
     assert there.any() and not np.array(found.corner_deviations)[there].any()
 
@@ -163,6 +161,5 @@ def test_start_velocities_are_within_the_limits_or_rest() -> None:
 def test_a_start_velocity_that_cannot_stop_is_invalid(first: float, jerk: float | None) -> None:
     task = rd.Problem(PANDA, rd.Scene(), np.array([first, *START[1:]]), GOAL, start_velocity=np.eye(7)[0] * 2.0)
     found = rd.load_planner("rrt_connect").plan(task, jerk=jerk)
-    assert found.status is rd.Status.INVALID_START
-    assert "panda_joint1 cannot stop" in found.reason
+    assert found.status is rd.Status.INVALID_START and "panda_joint1 cannot stop" in found.reason
     refuses(r"velocity_scaling allows 1\.08", rd.load_planner("rrt_connect").plan, task, velocity_scaling=0.5)

@@ -65,8 +65,7 @@ def test_predicted_obstacles_are_kept_clear_of(planner: Planner, tmp_path: Path)
     past = unknown_space.plan_with_unknown_space(planner, partial("predicted"), REQUEST, true)
     assert past.assumption == "predicted, p > 0.1" and past.swept_probability == 0
     assert past.path is not None and rd.verify(truth, past.path).valid
-    assert past.confidence is not None and through.confidence is not None
-    assert past.confidence > through.confidence
+    assert past.confidence is not None and through.confidence is not None and past.confidence > through.confidence
     past.save(tmp_path / "result.json")
     again = rd.load_result(tmp_path / "result.json").result
     for name in ("assumption", "confidence", "swept_probability", "unknown_region"):
@@ -79,8 +78,7 @@ def test_of_several_motions_the_one_that_sweeps_least_probability(planner: Plann
     first = planner.attempt(replace(problem, views=()), PlanRequest(1.0))
     unknown = observe(problem.views, PANDA, START).unknown.repeat(2, 0).repeat(2, 1).repeat(2, 2)
     crossed = FINE.swept(PANDA, first.path) & unknown & ~FINE.filled(PANDA, (START, GOAL))
-    assert chosen.swept_probability is not None
-    assert chosen.swept_probability <= 0.01 * crossed.sum() * (1 + 1e-3)
+    assert chosen.swept_probability is not None and chosen.swept_probability <= 0.01 * crossed.sum() * (1 + 1e-3)
 
 
 def test_the_unknown_region_is_found_for_the_chosen_motion_only(planner: Planner, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -176,8 +174,7 @@ def test_confidence_falls_with_what_rays_do_not_tell(planner: Planner) -> None:
     lost[:, :100] = 0.0
     views = view, replace(view, depth=lost, range=4.0)
     whole, half = (unknown_space.plan_with_unknown_space(planner, partial("optimistic", one), REQUEST) for one in views)
-    assert whole.confidence is not None and half.confidence is not None
-    assert half.confidence < 0.6 * whole.confidence
+    assert whole.confidence is not None and half.confidence is not None and half.confidence < 0.6 * whole.confidence
     assert any("of the pixels measure nothing" in note for note in half.notes)
     away = taken(rd.Scene([FLOOR]), looking_at(np.array([1.7, 0.0, 0.3]), np.array([3.0, 0.0, 0.0])))
     blind = unknown_space.plan_with_unknown_space(planner, partial("optimistic", away), REQUEST)

@@ -245,3 +245,16 @@ def test_limits_hold_at_every_time_however_often_the_arm_brakes(seed: int) -> No
         if filtered.at_rest and given.s[0] >= path.end:
             break
     assert np.array_equal(motion.positions[-1], waypoints[-1])
+
+
+def test_arms_move_off_from_near_the_end_of_a_path_rest_after_it_and_stay_at_a_goal() -> None:
+    """Regressions: an arm at rest 0.03 rad before its goal stayed there, a late step asked for 138 TiB, one at a goal swung."""
+    line = rounded_line(np.stack([START, GOAL]), np.zeros(0))
+    path = TimedPath(PANDA, JerkFilter(PANDA, jerk_limits(PANDA), 0.001, START).acceleration, line, True)
+    motion = path.advance_then_brake(path.end - 0.02, 0.0)
+    assert motion.s[-1] >= path.end and 0 < motion.duration < 1
+    ended = SpeedProfile(np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 0.0]))
+    assert ended.after(ended.duration - 1e-13).speeds.tolist() == [0.0]
+    far = [rd.MovingObstacle(rd.Sphere([3, 3, 3], 0.1), max_speed=SPEED)]
+    command = rd.Replanner(rd.Problem(PANDA, rd.Scene([FLOOR]), START, START, moving=far)).step({}, 0.0)
+    assert command.arrived and (command.motion.positions == START).all()

@@ -41,8 +41,7 @@ def test_paths_are_below_the_bound_and_join_the_ends() -> None:
         if not len(path):
             break
         assert path_length(path) <= bound + 1e-4
-        assert np.array_equal(path[0], start) and np.array_equal(path[-1], goals[0])
-        assert motions_free(space, path).all()
+        assert np.array_equal(path[0], start) and np.array_equal(path[-1], goals[0]) and motions_free(space, path).all()
         for tree in (0, 1):  # costs are the lengths of the ways from the roots
             size = trees.sizes[tree]
             nodes = trees.nodes[tree, :size]
@@ -72,8 +71,7 @@ def test_trees_that_are_kept_hold_free_edges_and_change_no_path(limit: float) ->
         assert np.array_equal(tree.nodes[0], root.astype(np.float32)) and len(children)
         for child in children:
             parent = tree.parents[child]
-            assert parent < child
-            assert motions_free(space, tree.nodes[[parent, child]]).all()
+            assert parent < child and motions_free(space, tree.nodes[[parent, child]]).all()
     assert "trees" not in kept.record()
 
 
@@ -151,8 +149,7 @@ def test_simplification_keeps_ends_and_freedom_and_does_not_lengthen() -> None:
         for rounds, tries in ((0, 0), (1, 0), (4, 10), (1, 300)):
             short = tighten(space, simplify(space, path, rounds), tries, state)
             assert np.array_equal(short[[0, -1]], path[[0, -1]])
-            assert path_length(short) <= path_length(path) + 1e-4
-            assert motions_free(space, short).all()
+            assert path_length(short) <= path_length(path) + 1e-4 and motions_free(space, short).all()
         assert np.array_equal(simplify(space, path.astype(np.float64), 0), simplify(space, path, 0))
 
 
@@ -164,8 +161,7 @@ def test_a_long_detour_is_replaced() -> None:
 
 def test_a_step_of_nearly_a_whole_turn_is_two_steps() -> None:
     """On the free way, a continuous joint turns by 5.84 rad, which the validator refuses as one step."""
-    start = np.array([0.22, 1.4, 0.0, 0.3, 0.0, 0.0, 0.0])
-    goal = np.array([-0.22, 1.4, 0.0, 0.3, 0.0, 0.0, 0.0])
+    start, goal = (np.array([turn, 1.4, 0.0, 0.3, 0.0, 0.0, 0.0]) for turn in (0.22, -0.22))
     problem = rd.Problem(rd.load_robot("gen3"), rd.Scene([rd.Box([0.9, 0.0, 0.5], [0.8, 0.02, 1.6])]), start, goal)
     result = AORRTC().plan(problem, until="first")
     assert result.solved and result.stage == "straight_line"

@@ -131,8 +131,7 @@ def test_samples_fill_the_hyperspheroid_evenly() -> None:
     space = search_space(CollisionChecker(PANDA, WALL), 0.04)._replace(lower=-wide, upper=wide)
     gap = np.float32(np.linalg.norm(b - a))
     state = random_state(0)
-    length = np.float32(1.5) * gap
-    inner = np.float32(1.2) * gap
+    inner, length = np.float32(1.2) * gap, np.float32(1.5) * gap
     out = np.empty(4, np.float32)
     sums = []
     for _ in range(20_000):
@@ -206,8 +205,7 @@ def test_a_gap_too_narrow_for_the_distance_lowers_it() -> None:
     arm = two_joints()
     arm = arm.with_locked({arm.joint_names[1]: 0.0})
     checker = CollisionChecker(arm, rd.Scene([rd.Sphere([0.87, 0.0, side * 0.16], 0.1) for side in (1, -1)]))
-    start = np.array([-0.9])
-    goal = np.array([0.9])
+    start, goal = np.array([[-0.9], [0.9]])
     assert 0.01 < checker.link_clearances(np.linspace(start, goal, 200)).min() < 0.02
     search = SharedTreeSearch(checker, start, goal[None], ENDLESS, random_state(0))
     search.run(lambda: search.cost < np.inf)
@@ -225,5 +223,4 @@ def test_what_ends_a_search_without_a_path() -> None:
     settings = replace(TOUCHING, growth=1, connect_iterations=1, step_rounds=1, rounds=5)
     search = SharedTreeSearch(CollisionChecker(PANDA, WALL), LEFT, RIGHT[None], settings, random_state(0))
     search.run()
-    assert search.best_goal == -1
-    assert len(search.costs) == 5
+    assert search.best_goal == -1 and len(search.costs) == 5

@@ -37,8 +37,7 @@ def test_motions_take_less_time_and_keep_their_certificate(planner: str) -> None
     made = rd.load_planner(planner)
     by_length = made.plan(AROUND, 60.0, objective="length")
     result = made.plan(AROUND, 60.0)
-    assert result.stops == 0
-    assert rd.verify(AROUND, result.trajectory).valid
+    assert result.stops == 0 and rd.verify(AROUND, result.trajectory).valid
     assert result.duration < 0.99 * by_length.duration
     if planner != "rrt_connect":  # which returns the shorter of two paths, not the shortest
         assert by_length.path.length < result.path.length

@@ -60,8 +60,7 @@ def test_forms_of_goals() -> None:
 
 def test_a_hair_over_a_limit_is_clamped_and_said() -> None:
     made = problem([2 + 1e-6, 0, -1e-8], [[0, 0, 0], [-1 - 9e-6, 0, 0]])
-    assert made.start.tolist() == [2.0, 0.0, 0.0]
-    assert isinstance(made.goal, rd.JointGoal) and made.goal.positions[1, 0] == -1.0
+    assert made.start.tolist() == [2.0, 0.0, 0.0] and isinstance(made.goal, rd.JointGoal) and made.goal.positions[1, 0] == -1.0
     assert made.notes == (
         "start: swing clamped from 2.000001 to its limit 2.0 rad",
         "start: lift clamped from -1e-08 to its limit 0.0 m",
@@ -107,10 +106,8 @@ GOOD: dict[str, Any] = {
 @pytest.mark.parametrize("ending", ["yaml", "json", "jsonl"])
 def test_problem_file(ending: str, tmp_path: Path) -> None:
     loaded = rd.load_problem(written(tmp_path, GOOD, f"problem.{ending}"))
-    assert loaded.robot.name == "panda"
-    assert loaded.robot.locked["panda_finger_joint1"] == 0.065
-    assert [shape.name for shape in loaded.scene.shapes] == ["sphere", "box", "pole"]
-    assert loaded.start.tolist() == READY
+    assert loaded.robot.name == "panda" and loaded.robot.locked["panda_finger_joint1"] == 0.065
+    assert [shape.name for shape in loaded.scene.shapes] == ["sphere", "box", "pole"] and loaded.start.tolist() == READY
     assert isinstance(loaded.goal, rd.JointGoal) and loaded.goal.positions.shape == (1, 7)
     assert rd.Problem.load(tmp_path / f"problem.{ending}").start.tolist() == READY
     [entry] = load_problems(tmp_path / f"problem.{ending}")
@@ -126,6 +123,7 @@ def shape(**entry: object) -> dict[str, Any]:
     return GOOD | {"scene": [GOOD["scene"][0], entry]}
 
 
+NO_TURN = {"frame": "panda_hand", "xyz": [0, 0, 1], "wxyz": [0, 0, 0, 0]}
 WRONG: dict[str, tuple[object, str]] = {
     "no mapping": (["panda"], "problem is .* it must be a mapping with the fields robot, scene, start, goal"),
     "unknown field": (GOOD | {"strat": []}, "unknown field of problem: 'strat'; known:"),
@@ -145,10 +143,7 @@ WRONG: dict[str, tuple[object, str]] = {
     "a robot without poses": (without("locked") | {"robot": "iiwa14", "start": "home"}, "iiwa14 has no named pose with values"),
     "two rotations": (shape(box={"rpy": [0] * 3, "wxyz": [1] * 4}), r"scene\[1\].box has both wxyz and rpy; give one of them"),
     "two angles": (GOOD | {"base": {"rpy": [0, 0]}}, r"base.rpy \[rad\] is \[0, 0\]; it must be 3 finite numbers"),
-    "zero quaternion": (
-        GOOD | {"goal": {"pose": {"frame": "panda_hand", "xyz": [0, 0, 1], "wxyz": [0, 0, 0, 0]}}},
-        "goal.pose.wxyz .* must not be zero",
-    ),
+    "zero quaternion": (GOOD | {"goal": {"pose": NO_TURN}}, "goal.pose.wxyz .* must not be zero"),
 }
 
 
@@ -164,8 +159,7 @@ def test_lines_of_problems(tmp_path: Path) -> None:
     file.write_text(lines[0] + "\n\n" + "\n".join(lines[1:]) + "\n")
     entries = load_problems(file)
     assert [entry.name for entry in entries] == ["many:1", "many:3", "many:4"]
-    assert [entry.load().start[0] for entry in entries] == [0, 0.1, 0.2]
-    assert entries[0].load().robot is entries[2].load().robot
+    assert [entry.load().start[0] for entry in entries] == [0, 0.1, 0.2] and entries[0].load().robot is entries[2].load().robot
     assert rd.load_problem(file, 1).start[0] == 0.1
     refuses(r"index is 3; .* holds 3 problems", rd.load_problem, file, 3)
     file.write_text(lines[0] + '\n{"robot": 3')
@@ -408,12 +402,8 @@ GOAL = [0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2]
 WALL = {"box": {"center": [0.5, 0.0, 0.25], "size": [0.3, 0.06, 0.3], "name": "wall"}}
 CUP = {"link": "panda_hand", "cylinder": {"center": [0, 0, 0.16], "radius": 0.03, "height": 0.12, "name": "cup"}}
 PLAIN: dict[str, Any] = {"robot": "panda", "scene": [WALL], "start": START, "goal": {"joints": GOAL}}
-TOOL = {
-    "link": "panda_hand",
-    "xyz": [0.0, 0.0, 0.2],
-    "shapes": [{"box": {"center": [0, 0, 0.14], "size": [0.03, 0.03, 0.12]}}],
-    "touch_links": ["panda_link6"],
-}
+FINGER = {"box": {"center": [0, 0, 0.14], "size": [0.03, 0.03, 0.12]}}
+TOOL = {"link": "panda_hand", "xyz": [0.0, 0.0, 0.2], "shapes": [FINGER], "touch_links": ["panda_link6"]}
 T_WORLD_BASE = transform(np.array([1.0, -2.0, 0.5]), rotation_about(np.array([0.6, 0.0, 0.8]), 2.0))
 WORLD_SHAPES: list[Shape] = [
     rd.Sphere([0.5, 0.5, 0.5], 0.1),
@@ -448,8 +438,7 @@ def test_base_moves_scene_goal_and_views_into_the_bases_frame() -> None:
     view = rd.DepthView(np.full((4, 4), 5.0), (4, 4, 2, 2), T_WORLD_BASE)
     goal = rd.PoseGoal("panda_hand", T_WORLD_BASE @ robot.fk(GOAL, "panda_hand"))
     problem = rd.Problem.in_world(T_WORLD_BASE, robot, rd.Scene(WORLD_SHAPES).moved(T_WORLD_BASE), START, goal, views=[view])
-    assert isinstance(problem.goal, rd.PoseGoal)
-    assert np.allclose(problem.goal.T_base_frame, robot.fk(GOAL, "panda_hand"))
+    assert isinstance(problem.goal, rd.PoseGoal) and np.allclose(problem.goal.T_base_frame, robot.fk(GOAL, "panda_hand"))
     assert np.allclose(problem.views[0].T_base_camera, np.eye(4))
     for shape, moved in zip(WORLD_SHAPES, problem.known_scene.shapes, strict=True):
         assert np.allclose(shape.bounds, moved.bounds, atol=1e-9)
@@ -476,8 +465,7 @@ def test_files_in_the_world_come_back_as_they_were_read(tmp_path: Path) -> None:
     }
     problem = rd.load_problem(written(tmp_path, record))
     again = problem_record(problem_from_record(problem_record(problem)))
-    assert again == problem_record(problem)
-    assert again["base"] == base and again["goal"] == record["goal"]
+    assert again == problem_record(problem) and again["base"] == base and again["goal"] == record["goal"]
     assert again["scene"][1] == record["scene"][1]  # type: ignore[index]
     turn = np.array([[0.28, -0.96, 0], [0.96, 0.28, 0], [0, 0, 1]])
     assert np.allclose(problem.scene.shapes[1].bounds.mean(0), [-0.2, 0.4, 0.7] @ turn)

@@ -161,8 +161,7 @@ def test_false_collisions_of_parts_after_true_ones_are_counted() -> None:
     robot = Robot("slider", "plates", "box", (slide,), spheres, parts)
     measured = self_collisions.measure_false_collisions(robot, surfaces, 2000, np.random.default_rng(0))
     # of 0.5 m, the box is in a plate for 0.12 m and between them, without touching one, for 0.24 m
-    assert measured.free == pytest.approx(0.76, abs=0.05)
-    assert measured.by_parts == pytest.approx(0.24 / 0.38, abs=0.05)
+    assert measured.free == pytest.approx(0.76, abs=0.05) and measured.by_parts == pytest.approx(0.24 / 0.38, abs=0.05)
 
 
 PAIR = ("fork", "flange")
@@ -230,8 +229,7 @@ def test_a_pair_that_is_always_close_refuses_little(gap: float) -> None:
     """Regression: no spheres that refinement found fit into the 7 mm in a PR2's shoulder, and it had no free configuration."""
     prepared = made(gap)
     robot = prepared.robot
-    assert [table.links for table in robot.tables] == [PAIR]
-    assert prepared.false_collisions.by_spheres < 0.08
+    assert [table.links for table in robot.tables] == [PAIR] and prepared.false_collisions.by_spheres < 0.08
     assert shares(replace(robot, tables=())) == (1.0, 0)
     refused, wrong = shares(robot)
     assert refused < 0.08 and wrong == 0

@@ -45,8 +45,7 @@ def test_spheres_cover_and_hardly_stick_out(name: str) -> None:
     meshes = SHAPES[name]
     solid = Solid.of(meshes, TOLERANCE)
     spheres = fit_spheres(solid, Bounds(TOLERANCE), np.random.default_rng(0), QUICK)
-    assert covered(meshes, spheres)
-    assert gaps(surface_samples(meshes, 20_000, 1), spheres).max() <= 1e-9
+    assert covered(meshes, spheres) and gaps(surface_samples(meshes, 20_000, 1), spheres).max() <= 1e-9
     assert stick_out(solid, spheres).max() <= TOLERANCE + solid.spacing
     # independent check: points on the spheres against the solid
     unit = np.random.default_rng(2).normal(size=(200, 3))
@@ -99,13 +98,10 @@ def test_nothing_reaches_below_the_floor() -> None:
 def test_a_ball_needs_one_sphere_and_a_small_gap_is_found() -> None:
     ball = (convex_hull(np.array(trimesh.creation.icosphere(2, 0.05).vertices)),)
     spheres = fit_spheres(Solid.of(ball, 0.01), Bounds(0.01), np.random.default_rng(0), QUICK)
-    assert len(spheres) == 1
-    assert np.linalg.norm(spheres[0, :3]) < 3e-3
-    assert spheres[0, 3] == pytest.approx(0.05, abs=3e-3)
+    assert len(spheres) == 1 and np.linalg.norm(spheres[0, :3]) < 3e-3 and spheres[0, 3] == pytest.approx(0.05, abs=3e-3)
     meshes = (box((0.1, 0.1, 0.1)),)
     spheres = np.array([[0, 0, 0, 0.05 * 3**0.5 + 1e-5]])
-    assert covered(meshes, spheres)
-    assert not covered(meshes, spheres - np.array([0, 0, 0, 2e-4]))
+    assert covered(meshes, spheres) and not covered(meshes, spheres - np.array([0, 0, 0, 2e-4]))
 
 
 def test_spheres_may_reach_into_a_neighbor_unless_it_turns_away() -> None:
@@ -121,8 +117,7 @@ def test_spheres_may_reach_into_a_neighbor_unless_it_turns_away() -> None:
     solid = Solid.of(robot.meshes["low"], TOLERANCE)
     spheres = fit_spheres(solid, Bounds(TOLERANCE, hidden), np.random.default_rng(0), QUICK)
     assert len(spheres) < len(fit_spheres(solid, Bounds(TOLERANCE), np.random.default_rng(0), QUICK))
-    assert covered(robot.meshes["low"], spheres)
-    assert stick_out(solid, spheres).max() > TOLERANCE
+    assert covered(robot.meshes["low"], spheres) and stick_out(solid, spheres).max() > TOLERANCE
     swing = replace(robot.joints[0], axis=np.array([0, 1.0, 0]), lower=-1.0, upper=1.0)
     assert not hidden_by_neighbors(replace(robot, joints=(swing,)), "low")(np.array([[0.04, 0, 0.23]])).any()
 

@@ -98,10 +98,8 @@ def test_an_arm_whose_spheres_always_collide_is_refused(tmp_path: Path, monkeypa
 
 def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:
     """Regression: goals of Fetch and Baxter collided, since the arm touches convex parts of the torso, but not the torso."""
-    trough = boxes(
-        ((-0.3, -0.2, 0), (0.3, 0.2, 0.05)), ((0.25, -0.2, 0.05), (0.3, 0.2, 0.4)), ((-0.3, -0.2, 0.05), (-0.25, 0.2, 0.4))
-    )
-    trough.export(tmp_path / "trough.stl")
+    sides = (((x, -0.2, 0.05), (x + 0.05, 0.2, 0.4)) for x in (0.25, -0.3))
+    boxes(((-0.3, -0.2, 0), (0.3, 0.2, 0.05)), *sides).export(tmp_path / "trough.stl")
     mesh = '<collision><geometry><mesh filename="trough.stl"/></geometry></collision>'
     stand = link("trough", mesh) + joint("stand", "base", "trough", "fixed", xyz="-0.1 0 -0.1")
     urdf = written(tmp_path, stand, chain("base", row("j", 3)))

@@ -70,8 +70,7 @@ def test_two_arms_are_listed_and_asked_about(tmp_path: Path) -> None:
     assert "--group left" in refuses(arms, read_urdf, file)
     for group in ("right", "right_7_link"):
         robot = read_urdf(file, group=group)
-        assert robot.joint_names == tuple(row("right_", 7))
-        assert robot.locked.keys() == {*row("left_", 7), "head"}
+        assert robot.joint_names == tuple(row("right_", 7)) and robot.locked.keys() == {*row("left_", 7), "head"}
         assert "left_7_link" in robot.meshes  # held, but still checked for collisions
     refuses(r"unknown group of .* 'middle'; known: all, both, left, right", read_urdf, file, group="middle")
 
@@ -151,14 +150,12 @@ def test_groups_poses_and_passive_joints_of_an_srdf(tmp_path: Path) -> None:
     file = written(tmp_path, ARM, chain("j6_link", ["grip"]))
     (tmp_path / "srdf").mkdir()
     (tmp_path / "srdf" / "made.srdf").write_text(SRDF)
-    assert srdf_beside(file, "any") == tmp_path / "srdf" / "made.srdf"
-    assert srdf_beside(tmp_path / "nothing.urdf", "any") is None
+    assert srdf_beside(file, "any") == tmp_path / "srdf" / "made.srdf" and srdf_beside(tmp_path / "nothing.urdf", "any") is None
     srdf = read_srdf(tmp_path / "srdf" / "made.srdf")
     assert srdf.allowed[frozenset(("base", "j6_link"))] == "User"
     robot = read_urdf(file, group="arm", srdf=srdf)
     assert robot.joint_names == ("j2", "j3", "j5", "j6") and robot.tip == "j6_link"
-    assert robot.locked == {"j1": 0.5, "j4": 0.0, "grip": 0.7}
-    assert any("j4 is passive" in note for note in robot.notes)
+    assert robot.locked == {"j1": 0.5, "j4": 0.0, "grip": 0.7} and any("j4 is passive" in note for note in robot.notes)
     assert robot.poses["home"] == {"j1": 0.5, "j3": 9.0}
     robot = read_urdf(file, group="short", srdf=srdf)
     assert robot.joint_names == ("j1", "j2") and robot.locked["j3"] == 2.0  # the pose, clipped

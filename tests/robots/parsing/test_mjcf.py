@@ -51,12 +51,9 @@ def test_frames_limits_poses_and_mimics_are_those_of_mujoco(file: Path) -> None:
     for q in np.random.default_rng(0).uniform(robot.lower, robot.upper, (50, robot.dof)):
         data = state_of(model, robot, q)
         bodies = ("base", "shoulder", "elbow", "wrist", "left_finger", "right_finger")
-        found = [(data.body(name).xpos, data.body(name).xmat, name) for name in bodies]
-        found.append((data.site("tool").xpos, data.site("tool").xmat, "tool"))
-        for position, rotation, name in found:
-            T = robot.fk(q, name)
-            np.testing.assert_allclose(T[:3, 3], position, atol=1e-9)
-            np.testing.assert_allclose(T[:3, :3], rotation.reshape(3, 3), atol=1e-9)
+        for there in (*(data.body(name) for name in bodies), data.site("tool")):
+            expected = np.column_stack([there.xmat.reshape(3, 3), there.xpos])
+            np.testing.assert_allclose(robot.fk(q, there.name)[:3], expected, atol=1e-9)
     np.testing.assert_allclose([robot.lower[1], robot.upper[1]], [-0.1, 0.2])
     assert next(joint for joint in robot.joints if joint.name == "j2").effort == 20
     assert robot.locked["f2"] == pytest.approx(0.01 + 0.001 + robot.locked["f1"])
@@ -153,8 +150,7 @@ def test_geoms_of_named_pairs_collide(tmp_path: Path) -> None:
     """Regression: geoms that collide only in named pairs were left out, and named pairs of excluded bodies were excluded."""
     tree = read(tmp_path, NAMED.format(f'<exclude body1="base" body2="hand"/>{PAIRS}'))
     assert [len(tree.surfaces(link)) for link in ("base", "arm", "hand")] == [1, 1, 1]
-    assert tree.semantics is not None
-    assert set(tree.semantics.allowed) == {frozenset(("arm", "hand"))}
+    assert tree.semantics is not None and set(tree.semantics.allowed) == {frozenset(("arm", "hand"))}
     [post] = rd.Scene.from_mujoco(mujoco.MjModel.from_xml_path(str(tmp_path / "m.xml"))).shapes
     assert post.name == "post"
 
@@ -163,8 +159,7 @@ def test_a_model_with_other_exclusions_or_keyframes_is_another_robot(tmp_path: P
     """Regression: `load_robot` took the robot that had been prepared with the old exclusions and poses."""
     changes = ("", ""), ("", ""), ('body2="elbow"', 'body2="wrist"'), ("0.5 0.1 0.4", "0.5 0.1 0.5")
     digests = [read(tmp_path, ARM.replace(old, new)).digest for old, new in changes]
-    assert digests[0] == digests[1]
-    assert len(set(digests)) == 3
+    assert digests[0] == digests[1] and len(set(digests)) == 3
 
 
 def test_reading_a_model_neither_warns_nor_writes_a_log(tmp_path: Path, monkeypatch, recwarn) -> None:
@@ -204,8 +199,7 @@ def test_a_base_on_slides_without_range_is_held(actuator: str, tmp_path: Path) -
     """As of Fetch in Gymnasium-Robotics, where nothing moves the slides, and of TidyBot, which drives on them."""
     tree = read(tmp_path, PLACED.replace("</mujoco>", actuator or "</mujoco>"))
     robot = tree.robot(srdf=tree.semantics)
-    assert robot.joint_names == ("j",)
-    assert robot.poses["home"] == {"j": 0.5}
+    assert robot.joint_names == ("j",) and robot.poses["home"] == {"j": 0.5}
     assert any("slide joint x" in note and "is held" in note for note in robot.notes)
     np.testing.assert_allclose(robot.fk(np.array([0.0]), "base")[:3, 3], [0.1, 0, 0.2], atol=1e-12)
 
@@ -277,9 +271,8 @@ def test_mirrored_meshes_are_where_mujoco_has_them_and_what_is_not_driven_is_non
     assert robot.joint_names == ("j",) and "other" not in robot.link_names
     data = state_of(mujoco.MjModel.from_xml_path(str(tmp_path / "m.xml")), robot, np.array([0.5]))
     for name in ("base", "arm"):
-        T = robot.fk(np.array([0.5]), name)
-        np.testing.assert_allclose(T[:3, 3], data.body(name).xpos, atol=1e-9)
-        np.testing.assert_allclose(T[:3, :3], data.body(name).xmat.reshape(3, 3), atol=1e-9)
+        expected = np.column_stack([data.body(name).xmat.reshape(3, 3), data.body(name).xpos])
+        np.testing.assert_allclose(robot.fk(np.array([0.5]), name)[:3], expected, atol=1e-9)
     [wedge] = tree.surfaces("base")
     np.testing.assert_allclose(wedge.vertices.min(axis=0), [-0.03, -0.075, -0.1], atol=1e-6)
     np.testing.assert_allclose(wedge.vertices.max(axis=0), [0.07, 0.025, 0.1], atol=1e-6)

@@ -38,13 +38,9 @@ def urdf(folder: Path, text: str = ARM) -> Path:
 
 def test_joints_limits_and_geometry(tmp_path: Path) -> None:
     robot = read_urdf(urdf(tmp_path))
-    assert (robot.name, robot.base, robot.tip) == ("tiny", "base", "fore")
-    assert robot.joint_names == ("turn", "bend")
-    np.testing.assert_allclose(robot.lower, [-2, -CONTINUOUS_LIMIT])
-    np.testing.assert_allclose(robot.upper, [1, CONTINUOUS_LIMIT])
-    np.testing.assert_allclose(robot.velocity, [1.5, 1.0])
-    np.testing.assert_allclose(robot.acceleration, [6, 4])
-    np.testing.assert_allclose(robot.jerk, [60, 40])
+    assert (robot.name, robot.base, robot.tip) == ("tiny", "base", "fore") and robot.joint_names == ("turn", "bend")
+    np.testing.assert_allclose([robot.lower, robot.upper], [[-2, -CONTINUOUS_LIMIT], [1, CONTINUOUS_LIMIT]])
+    np.testing.assert_allclose([robot.velocity, robot.acceleration, robot.jerk], [[1.5, 1.0], [6, 4], [60, 40]])
     np.testing.assert_allclose(robot.planned_joints[0].axis, [0, 0, 1])
     assert any("bend" in note and "velocity" in note for note in robot.notes)
     box = robot.meshes["upper"][0].vertices
@@ -146,11 +142,9 @@ def test_limits_file(tmp_path: Path) -> None:
         "  bend: {max_acceleration: 3.5, min_position: -1, has_jerk: false}\n"  # as KUKA's files have it
     )
     robot = with_limits(read_urdf(urdf(tmp_path)), read_limits(file)[0])
-    np.testing.assert_allclose(robot.velocity, [2, 1])
     assert robot.planned_joints[0].effort == 9
-    np.testing.assert_allclose(robot.acceleration, [8, 3.5])
-    np.testing.assert_allclose(robot.jerk, [80, 35])
-    np.testing.assert_allclose(robot.lower, [-2, -1])
+    found = [robot.lower, robot.velocity, robot.acceleration, robot.jerk]
+    np.testing.assert_allclose(found, [[-2, -1], [2, 1], [8, 3.5], [80, 35]])
     file.write_text("default_velocity_scaling_factor: 0.1\njoint_limits: {j: {max_velocity: 1}}\n")
     note = "limits.yaml: default_velocity_scaling_factor 0.1 is ignored; plan with velocity_scaling=0.1"
     assert read_limits(file) == ({"j": {"velocity": 1.0}}, (note,))
@@ -172,8 +166,7 @@ def test_limits_of_a_file_decide_which_joints_are_held(tmp_path: Path) -> None:
     """A joint with equal new limits was planned, which inverse kinematics cannot do; a held joint stayed outside of its."""
     tree = UrdfTree(urdf(tmp_path, ARM.replace("</robot>", GRIPPER)), {})
     robot = tree.robot(limits={"bend": {"lower": 0.5, "upper": 0.5, "velocity": 2.0}, "grip": {"lower": 0.02}})
-    assert robot.joint_names == ("turn",)
-    assert robot.locked == {"bend": 0.5, "grip": 0.02, "grip2": 0.02}
+    assert robot.joint_names == ("turn",) and robot.locked == {"bend": 0.5, "grip": 0.02, "grip2": 0.02}
     assert not any("no velocity limit" in note for note in robot.notes)
 
 
@@ -238,8 +231,7 @@ def test_limits_beyond_all_measure_stand_for_none(tmp_path: Path) -> None:
     fast = chain("base", ["j"]).replace('velocity="2"', 'velocity="1e+9"')
     propeller = link("propeller") + joint("turn", "base", "propeller", limits='lower="0.5" upper="1e+16"')
     robot = read_urdf(written(tmp_path, fast, propeller), tip="j_link")
-    assert robot.velocity == [1.0] and robot.locked == {"turn": 0.0}
-    assert "no velocity limit for j; 1 assumed" in robot.notes
+    assert robot.velocity == [1.0] and robot.locked == {"turn": 0.0} and "no velocity limit for j; 1 assumed" in robot.notes
 
 
 def test_soft_limits_are_noted(tmp_path: Path) -> None:
@@ -361,8 +353,7 @@ def surfaces(file: Path, shape: str, origin: str = "") -> tuple[Surface, ...]:
 def test_polyhedra_lie_closely_around_primitives(tmp_path: Path, shape: str, volume: float, extents: list[float]) -> None:
     [surface] = surfaces(tmp_path / "arm.urdf", shape)
     solid = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
-    assert solid.is_watertight and -1e-9 < solid.volume / volume - 1 < 0.06
-    assert (solid.extents > np.array(extents) - 1e-9).all()
+    assert solid.is_watertight and -1e-9 < solid.volume / volume - 1 < 0.06 and (solid.extents > np.array(extents) - 1e-9).all()
     np.testing.assert_allclose(solid.extents, extents, rtol=0.03)
 
 
@@ -441,8 +432,7 @@ def test_xacro_is_compiled_with_what_it_includes(tmp_path: Path) -> None:
     )
     file = xacro(tmp_path / "top", content)
     robot = read_urdf(file)
-    assert robot.joint_names == ("j1", "j2", "j3", "j4") and "end" in robot.meshes
-    assert "runs the code" in robot.notes[0]
+    assert robot.joint_names == ("j1", "j2", "j3", "j4") and "end" in robot.meshes and "runs the code" in robot.notes[0]
     digest = UrdfTree(file, {}, compile_xacro=True).digest
     xacro(part / "urdf", macro.replace("0.04", "0.05"), "solid.xacro")
     assert UrdfTree(file, {}, compile_xacro=True).digest != digest  # of the compiled URDF, not of the file

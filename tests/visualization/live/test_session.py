@@ -78,8 +78,7 @@ def test_why_there_is_no_plan(session: live.Session) -> None:
     state = state_when(session, settled)
     assert state.answer is not None and state.answer.status is rd.Status.INVALID_GOAL
     shown = live.validity(state)
-    assert shown.kind == live.INVALID
-    assert "no new plan: invalid_goal: the goal is in collision" in shown.lines[-1]
+    assert shown.kind == live.INVALID and "no new plan: invalid_goal: the goal is in collision" in shown.lines[-1]
 
 
 def test_the_target_is_dragged(session: live.Session) -> None:
@@ -143,8 +142,7 @@ def test_the_latest_request_wins(slow: live.Session) -> None:
     for height in (1.6, 1.7, 1.8):
         T = transform(np.array([0.0, 0.0, height]))
         slow.change_obstacle("lamp", lambda shape, T=T: live.moved_to(shape, T))
-    for _ in range(2):
-        SlowPlanner.go.release()
+    SlowPlanner.go.release(2)
     state = state_when(slow, settled)
     heights = [problem.scene.shapes[0].bounds.mean(axis=0)[2] for problem in SlowPlanner.calls]
     assert heights == pytest.approx([1.5, 1.8]) and state.answer is not None and state.answer.solved
@@ -167,8 +165,7 @@ def test_an_overtaken_plan_is_dropped_if_it_is_no_longer_free(slow: live.Session
 def test_a_plan_for_a_robot_that_has_gone_is_dropped(slow: live.Session) -> None:
     start = np.array([0.0, -1.2, 1.2, 0.0, 0.5, 0.0])
     slow.open(rd.Problem(rd.load_robot("ur5"), rd.Scene(), start, rd.JointGoal(start + 0.2)))
-    for _ in range(2):
-        SlowPlanner.go.release()
+    SlowPlanner.go.release(2)
     state = state_when(slow, lambda state: settled(state) and state.motion)
     assert state.motion is not None and state.motion.robot == "ur5"
 
@@ -232,6 +229,7 @@ scene: []
 start: [0, 0, 0, -1.5, 0, 1.5, 0]
 goal: {joints: [1, 0, 0, -1.5, 0, 1.5, 0]}
 """
+VIEWS = "views: [{cloud: x.ply, camera: {xyz: [1, 0, 1], wxyz: [0, 1, 0, 0]}}]\n"
 
 
 @pytest.mark.parametrize(
@@ -242,10 +240,7 @@ goal: {joints: [1, 0, 0, -1.5, 0, 1.5, 0]}
         (GOOD.replace("panda", "[panda]"), r"unknown robot \['panda'\]; known: "),
         (GOOD.replace("[]", "secret.yaml"), "secret.yaml is a file, and files are not read here"),
         (GOOD.replace("[]", "[{mesh: {file: /etc/passwd}}]"), "/etc/passwd is a file, and files are not"),
-        (
-            GOOD + "views: [{cloud: x.ply, camera: {xyz: [1, 0, 1], wxyz: [0, 1, 0, 0]}}]\n",
-            "x.ply is a file, and files are not read here",
-        ),
+        (GOOD + VIEWS, "x.ply is a file, and files are not read here"),
         (GOOD + "attached: [{link: panda_hand, mesh: {file: x.stl}}]\n", "x.stl is a file, and files are not read here"),
         (GOOD.replace("-1.5", "9"), "start: panda_joint4 is 9 rad; its limits are"),
         ("robot: panda\nscene: []\nrequest: x.yaml\n", "x.yaml is a file, and files are not read here"),

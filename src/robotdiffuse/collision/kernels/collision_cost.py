@@ -19,7 +19,7 @@ from robotdiffuse.collision.kernels.lane_clearance import (
     pair_clearances,
     to_solid,
 )
-from robotdiffuse.collision.kernels.lane_collision import in_axes, near_boxes
+from robotdiffuse.collision.kernels.lane_collision import in_axes, near_boxes, placed
 from robotdiffuse.collision.kernels.point_grid import near_point, points_lower_bound
 from robotdiffuse.collision.kernels.simd import W, first_lane, lane, load, load_vector, minimum, vector_in
 from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
@@ -56,12 +56,6 @@ def frames_of(robot, q, frames):
             z = dot(row, offset[2::3])
             write((x * c + y * s, y * c - x * s, z), child[3 * k :])
             child[9 + k] = dot(row, offset[9:]) + parent[9 + k] + z * slide
-
-
-@allocation_free(forceinline=True)
-def placed(frame, p):
-    """Position in the base frame of the point p of a frame[12]. The coordinates may be those of 16 points."""
-    return dot(frame, p) + frame[9], dot(frame[3:], p) + frame[10], dot(frame[6:], p) + frame[11]
 
 
 @allocation_free(fastmath=True)

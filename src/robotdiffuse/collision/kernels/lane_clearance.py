@@ -20,6 +20,7 @@ from robotdiffuse.collision.kernels.lane_collision import (
     centers_of,
     in_axes,
     lanes_that_may_touch,
+    make_workspace,
     place_frames,
     take_block,
 )
@@ -78,17 +79,13 @@ class ClearanceWorkspace(NamedTuple):
 @kernel()
 def make_clearance_workspace(robot, solids):
     """Scratch memory for one thread and at most `solids` solids."""
-    joints = len(robot.offsets)
-    groups = len(robot.frame)
-    frames = np.zeros((joints + 1, 12 * W), np.float32)
-    for k in (0, 4, 8):
-        frames[0, k * W : (k + 1) * W] = 1.0
+    frames, centers, _ = make_workspace(robot)
     return ClearanceWorkspace(
         frames,
-        np.zeros((joints + 1, 6 * W), np.float32),
-        np.empty((groups, 3 * W), np.float32),
+        np.zeros((len(frames), 6 * W), np.float32),
+        centers,
         np.empty((len(robot.spheres), 3 * W), np.float32),
-        np.empty(groups, np.bool_),
+        np.empty(len(centers), np.bool_),
         np.empty(solids + 1, np.bool_),
         np.empty((solids + 1, W), np.float32),
         np.empty((1, W), np.float32),

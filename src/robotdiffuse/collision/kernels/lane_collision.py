@@ -154,15 +154,15 @@ def _touching(centers, radius, solid):
 
 
 @allocation_free(forceinline=True)
+def placed(frame, p):
+    """Position in the base frame of the point p of a frame[12]. The coordinates may be those of 16 points."""
+    return dot(frame, p) + frame[9], dot(frame[3:], p) + frame[10], dot(frame[6:], p) + frame[11]
+
+
+@allocation_free(forceinline=True)
 def _place_row(robot, row, frames, f, i):
     """Positions of a row of spheres in configuration (lane) i."""
-    centers = load_vector(robot.rows, row, 0)
-    frame = frames[f, i::W]
-    return (
-        dot(centers, frame) + frame[9],
-        dot(centers, frame[3:]) + frame[10],
-        dot(centers, frame[6:]) + frame[11],
-    )
+    return placed(frames[f, i::W], load_vector(robot.rows, row, 0))
 
 
 @allocation_free(forceinline=True)
@@ -237,10 +237,10 @@ def _rows_touch(robot, row, f, other_row, other_f, i, work):
     """Whether a row of spheres of frame f touches the row `other_row` of frame `other_f` in lane i."""
     centers = _place_row(robot, row, work.frames, f, i)
     radius = load(robot.rows, row, 3)
-    placed = work.row
-    store_vector(placed, 0, 0, _place_row(robot, other_row, work.frames, other_f, i))
+    others = work.row
+    store_vector(others, 0, 0, _place_row(robot, other_row, work.frames, other_f, i))
     for t in range(W):
-        if _touching_balls(centers, radius + robot.rows[other_row, 3 * W + t], placed[0, t::W], _ZERO):
+        if _touching_balls(centers, radius + robot.rows[other_row, 3 * W + t], others[0, t::W], _ZERO):
             return True
     return False
 

@@ -181,6 +181,7 @@ def bound_by_spheres(arm, scene, motion, checks, pieces, best, work):
         for c in range(count - 1, -1, -1):
             undecided_count = 0
             kind = checks.kind[c]
+            index = checks.sphere_index[c]
             for i in range(W):
                 row = first + i
                 work.need[0, i] = -1.0
@@ -189,15 +190,15 @@ def bound_by_spheres(arm, scene, motion, checks, pieces, best, work):
                     work.need[0, i] = best[kind] + rest[row, c] + FLOAT32_SLACK
             if undecided_count == 0:
                 continue
-            if checks.sphere_index[c] >= 0:
+            if index >= 0:
                 if kind == SCENE:
-                    group_along(arm.spheres, scene, checks.sphere_index[c], True, work)
+                    group_along(arm.spheres, scene, index, True, work)
                 else:
-                    pair_along(arm.spheres, checks.sphere_index[c], True, work)
+                    pair_along(arm.spheres, index, True, work)
             for row in range(first, last):
                 if not pieces.undecided[row, c]:
                     continue
-                if checks.sphere_index[c] < 0:
+                if index < 0:
                     clearance[row, c] = lower[row, c] = -np.inf
                     continue
                 clearance[row, c] = work.clearance[0, row - first] - FLOAT32_SLACK
@@ -340,8 +341,8 @@ def settle(checks, bounds, best, certified, tightness):
 def rounds(arm, scene, solids, motion, checks, pieces, best, certified, tightness, contact):
     """Repeats bounding, settling and splitting until a check needs Coal, or no piece is left.
 
-    Lowers best[kind] and certified[kind]. Returns the bounds of the last round, before settling, and the rows
-    and columns in them of the checks that Coal has to decide, in the order of the motion.
+    Lowers best[kind] and certified[kind]. Returns the bounds of the last round, before settling; `travel` in
+    them marks the checks that Coal has to decide.
     """
     work = make_clearance_workspace(arm.spheres, len(scene.solids))
     posture = meshes.make_posture(arm.hulls, solids, motion.q.shape[1])
@@ -350,16 +351,6 @@ def rounds(arm, scene, solids, motion, checks, pieces, best, certified, tightnes
         open_count = bound_by_convex_parts(
             arm, solids, motion, checks, bounds, best, tightness, contact, posture
         )
-        n, count = bounds.clearance.shape
-        if n == 0 or open_count:
-            rows = np.empty(open_count, np.int64)
-            columns = np.empty(open_count, np.int64)
-            k = 0
-            for row in range(n):
-                for c in range(count):
-                    if bounds.travel[row, c] >= 0:
-                        rows[k] = row
-                        columns[k] = c
-                        k += 1
-            return bounds, rows, columns
+        if open_count or len(bounds.travel) == 0:
+            return bounds
         pieces = settle(checks, bounds, best, certified, tightness)

@@ -95,21 +95,22 @@ def pose_at(tracks, o, time, rotation, box_center):
         low += np.searchsorted(tracks.times[low : high + 1], time, side="right") - 1
         share = (time - tracks.times[low]) / (tracks.times[low + 1] - tracks.times[low])
     high = min(low + 1, high)
+    wxyz = tracks.wxyz
     dot = 0.0
     for k in range(3):
         box_center[k] = tracks.xyz[low, k] + share * (tracks.xyz[high, k] - tracks.xyz[low, k])
     for k in range(4):
-        dot += tracks.wxyz[low, k] * tracks.wxyz[high, k]
+        dot += wxyz[low, k] * wxyz[high, k]
     angle = np.arccos(min(max(dot, -1.0), 1.0))
     a = 1.0 - share
     b = share
     if angle > 1e-7:
         a = np.sin((1.0 - share) * angle) / np.sin(angle)
         b = np.sin(share * angle) / np.sin(angle)
-    w = a * tracks.wxyz[low, 0] + b * tracks.wxyz[high, 0]
-    x = a * tracks.wxyz[low, 1] + b * tracks.wxyz[high, 1]
-    y = a * tracks.wxyz[low, 2] + b * tracks.wxyz[high, 2]
-    z = a * tracks.wxyz[low, 3] + b * tracks.wxyz[high, 3]
+    w = a * wxyz[low, 0] + b * wxyz[high, 0]
+    x = a * wxyz[low, 1] + b * wxyz[high, 1]
+    y = a * wxyz[low, 2] + b * wxyz[high, 2]
+    z = a * wxyz[low, 3] + b * wxyz[high, 3]
     scale = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
     write_rotation(w * scale, -x * scale, -y * scale, -z * scale, rotation)
     write(plus(rotated_back(rotation, tracks.center[o]), box_center), box_center)

@@ -55,9 +55,10 @@ class _LanesModel(PrimitiveModel):
         super().__init__(dmm, fe_type, _VECTOR)
 
 
-def _splat(builder: Any, scalar: Any) -> Any:
-    single = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), scalar, ir.Constant(_BITS, 0))
-    return builder.shuffle_vector(single, ir.Constant(_VECTOR, ir.Undefined), _FIRST_TO_ALL)
+def _splat(builder: Any, scalar: Any, kind: ir.Type = _VECTOR) -> Any:
+    """A vector of this kind with the number in all lanes."""
+    single = builder.insert_element(ir.Constant(kind, ir.Undefined), scalar, ir.Constant(_BITS, 0))
+    return builder.shuffle_vector(single, ir.Constant(kind, ir.Undefined), _FIRST_TO_ALL)
 
 
 @lower_cast(types.float32, LanesType)
@@ -234,9 +235,7 @@ def lanes_with_bit(_context: Any, a: Any, bit: Any) -> Any:
 
     def codegen(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
         numbers = builder.fptosi(args[0], _INTEGERS)
-        single = builder.insert_element(ir.Constant(_INTEGERS, ir.Undefined), args[1], ir.Constant(_BITS, 0))
-        bits = builder.shuffle_vector(single, ir.Constant(_INTEGERS, ir.Undefined), _FIRST_TO_ALL)
-        common = builder.and_(numbers, bits)
+        common = builder.and_(numbers, _splat(builder, args[1], _INTEGERS))
         return _mask(builder, builder.icmp_unsigned("!=", common, ir.Constant(_INTEGERS, [0] * W)))
 
     return (types.int64(a, bit), codegen) if a == LANES and bit == types.int32 else None

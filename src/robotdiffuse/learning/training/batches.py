@@ -5,7 +5,7 @@ import hashlib
 import timeit
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, cached_property
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.files import write_atomically
-from robotdiffuse.core.types import Mask, Values
+from robotdiffuse.core.types import Mask, Values, frozen_dataclass
 from robotdiffuse.datasets.shards import SPLITS, read_rows, shard_indices, turns_about_vertical
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.checkpoint import fingerprint
@@ -59,7 +59,7 @@ def random_scenes(count: int, max_obstacles: int, rng: Generator, rop: bool = Fa
     return PackedScenes(kinds, params)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class TrajectoryData:
     """Planned trajectories with their scenes, in memory."""
 
@@ -227,7 +227,7 @@ def fast_autocast() -> torch.autocast:
     return torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16())
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Batch:
     """Noisy trajectories and the clean trajectories from which they were made; float32."""
 
@@ -255,7 +255,7 @@ class Batch:
     scenes: PackedScenes
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Batches:
     """Draws training batches: rows of the data at random noise levels. Half of the trajectories are reversed,
     since the reverse of a valid trajectory is valid too."""

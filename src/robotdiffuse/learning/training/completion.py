@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.settings import Count, Filled, Natural, OneOf, Positive
+from robotdiffuse.core.settings import Count, Filled, Natural, OneOf, Positive, ShareBelowOne
 from robotdiffuse.learning.checkpoint import load_completion
 from robotdiffuse.learning.completion import (
     FREE,
@@ -31,7 +31,7 @@ from robotdiffuse.learning.completion import (
 )
 from robotdiffuse.learning.completion_network import CompletionNetwork, folded
 from robotdiffuse.learning.network import Scalar
-from robotdiffuse.learning.training.config import ShareBelowOne, TrainingSettings
+from robotdiffuse.learning.training.config import TrainingSettings
 from robotdiffuse.learning.training.loop import Processes, TrainingTask, Validation, train
 from robotdiffuse.perception.voxel_grid import VOXEL
 from robotdiffuse.problems.families import FAMILIES
@@ -228,7 +228,7 @@ class CompletionTask(TrainingTask):
             rng = np.random.default_rng([HELD_OUT_SEED, list(FAMILIES).index(name)])
             seeds = rng.integers(SEED_LIMIT, size=first + count)[first:]
             parts.append(draw_samples((name,), self.robot, seeds.tolist()))
-        return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+        return Samples(*map(np.concatenate, zip(*parts, strict=True)))
 
     def _logits_and_truth(self, samples: Samples) -> tuple[Tensor, Tensor, Tensor]:
         """Logits [m 8] and truth [m 8] of the fine voxels that the network predicts, and the indices [m] of
@@ -257,7 +257,7 @@ class CompletionTask(TrainingTask):
                 logits, truth, indices = self._logits_and_truth(part)
             unknown = folded(torch.from_numpy(hidden)).reshape(-1)[indices].numpy().repeat(8)
             predictions.append((logits.cpu().numpy().ravel(), truth.cpu().numpy().ravel(), unknown))
-        logits, truth, unknown = (np.concatenate(parts) for parts in zip(*predictions, strict=True))
+        logits, truth, unknown = map(np.concatenate, zip(*predictions, strict=True))
         return logits, truth, unknown
 
 

@@ -16,6 +16,7 @@ from robotdiffuse.core.settings import (
     Settings,
     SettingsOf,
     Share,
+    ShareBelowOne,
 )
 from robotdiffuse.learning.denoisers import (
     DENOISERS,
@@ -38,9 +39,6 @@ it ends, and the number of waypoints in a block: in this stage, each token is th
 def block_at(fraction: float) -> int:
     """Waypoints in a block when this fraction of progressive training is done."""
     return next((block for end, block in STAGES if fraction < end), STAGES[-1][1])
-
-
-ShareBelowOne = Annotated[float, Bound(least=0.0, below=1.0)]
 
 
 def one_length(given: dict[str, Any]) -> dict[str, Any]:

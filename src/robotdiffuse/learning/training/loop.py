@@ -12,6 +12,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -52,10 +53,9 @@ class Processes:
     def __init__(self, device: str | None) -> None:
         """device: cpu or cuda (each process then uses its own GPU); None: cuda if present, otherwise cpu.
 
-        Matrices are multiplied in bf16 on devices that do so fast. From now on, this process computes with 0
-        in place of numbers below 1e-38. Raises InputError if Accelerate is not installed, the device is
-        missing, this process has trained on another device, or PyTorch's default type of numbers is not
-        float32.
+        Matrices are multiplied in bf16 on devices that do so fast. Raises InputError if Accelerate is not
+        installed, the device is missing, this process has trained on another device, or PyTorch's default
+        type of numbers is not float32.
         """
         default = torch.get_default_dtype()
         if default != torch.float32:
@@ -68,9 +68,6 @@ class Processes:
         with needs("accelerate", "train"):
             from accelerate import Accelerator, PartialState
         cpu = device == "cpu" or not cuda
-        # Attention has weights below 1e-38, with which processors compute slowly: a step of config `paper`
-        # took a third longer. Threads keep the setting under which they began, at the first product.
-        torch.set_flush_denormal(True)
         bf16 = fast_bf16() if cpu else torch.cuda.is_bf16_supported(including_emulation=False)
         device_type = "cpu" if cpu else "cuda"
         # Accelerate keeps one state per interpreter, from its first use
@@ -273,12 +270,15 @@ class TrainingRun:
             lock = lock_folder(self.out) if self.processes.first else nullcontext()
             stopped_by: list[int] = []  # only noted, so that the current step is finished first
             stopping = handled(lambda number, _: stopped_by.append(number), *STOPS)
-            with lock, stopping, _progress(self.processes.first) as progress:
+            # Attention has weights below 1e-38, with which processors compute slowly: a step of config
+            # `paper` took a third longer. The thread of the steps, and those that it starts, take them for 0.
+            steps = ThreadPoolExecutor(1, initializer=torch.set_flush_denormal, initargs=(True,))
+            with lock, stopping, steps, _progress(self.processes.first) as progress:
                 bar = progress.add_task(self.task.title, total=1.0, rate="", loss="")
                 last = saved = time.monotonic()
                 stopped = 0.0
                 while self.fraction < 1.0 and not stopped:
-                    self.step()
+                    steps.submit(self.step).result()
                     now = time.monotonic()
                     due = now - saved > self.settings.checkpoint_seconds
                     # the mean over the processes is above 0 if any one of them got a signal or is due

@@ -126,7 +126,7 @@ class SurfacePoints:
         for link, meshes in robot.meshes.items():
             if robot.link_frame(link) == 0 or not meshes:
                 continue
-            corners = np.concatenate([mesh.vertices[mesh.faces].reshape(-1, 3) for mesh in meshes])
+            corners = np.concatenate([mesh.triangles.reshape(-1, 3) for mesh in meshes])
             triangles = Mesh(corners, np.arange(len(corners)).reshape(-1, 3))
             points.append(placed(robot.T_frame_link(link), draw(triangles, per_link, rng)))
             frames.append(np.full(per_link, robot.link_frame(link)))

@@ -27,7 +27,7 @@ motion was planned; they are validated again among the obstacles that were seen 
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from itertools import islice, product
 
@@ -47,6 +47,7 @@ from robotdiffuse.core.types import (
     PlanResult,
     Status,
     Trajectory,
+    frozen_dataclass,
 )
 from robotdiffuse.perception.camera_check import contradiction, implausible
 from robotdiffuse.perception.depth_view import DepthView
@@ -116,7 +117,7 @@ LIMIT_TOLERANCE = 1e-3
 """Accelerations and jerks may exceed their limits by this fraction of the limit."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Stop:
     """How a motion ends early."""
 
@@ -128,40 +129,6 @@ class Stop:
     """The violation that the motion would have: what is in the way."""
     certified: bool
     """Whether the validator accepts the stop among all that was seen; if not, the arm cannot stop in time."""
-
-
-def stop_before(
-    robot: Robot,
-    known: Scene,
-    views: Sequence[DepthView],
-    free: Voxels,
-    motion: Trajectory,
-    time: float,
-) -> Stop | None:
-    """A stop that begins at `time` and comes to rest as early as possible, if views show an obstacle in the
-    way of the rest of the motion; otherwise None.
-
-    The stop is within the robot's limits of velocity, acceleration and jerk. Points in space that was free
-    before belong to an object that appeared; these points are padded, since only the object's front is seen.
-
-    views: views taken during the motion. free: `OccupancyMap.free` when the motion was planned. time: when a
-    new command takes effect, in time of the motion [s]. Raises InputError for a time outside the motion.
-    """
-    if not 0 <= time <= motion.duration:
-        raise InputError(f"time is {shown(time)}; it must be in [0, {motion.duration:.4g}] s of the motion")
-    current = motion.at(time).positions
-    end = motion.positions[-1]
-    seen = seen_shapes(views, robot, known, current, end[None])
-    points = np.concatenate([np.zeros((0, 3)), *(shape.points for shape in seen)])
-    appeared = PointCloud(points[MAP.enclose(free, points, MAP.edge)], APPEARED_PADDING, name="appeared")
-    validator = verifier(Problem(robot, added(known, [*seen, appeared]), current, end))
-    remaining = np.concatenate([current[None], motion.positions[motion.times > time]])
-    violation = validator.path(Path(robot.joint_names, remaining)).violation
-    if violation is None:
-        return None
-    stop = braked(robot, motion, time)
-    certified = validator.collision_free(Path(robot.joint_names, stop.positions))
-    return Stop(time, stop, violation.message, certified)
 
 
 def braked(robot: Robot, motion: Trajectory, time: float) -> Trajectory:
@@ -309,8 +276,7 @@ class Explorer:
         Raises:
             InputError: For a goal that does not fit the robot.
         """
-        middle = 0.5 * (self.robot.lower + self.robot.upper)
-        self._goal = Problem(self.robot, NOTHING, middle, goal).goal
+        self._goal = Problem(self.robot, NOTHING, self.robot.middle, goal).goal
         self._views_taken = 0
         self._looked_for[:] = False
         self._goal_seen.forget()
@@ -411,6 +377,8 @@ class Explorer:
         """End a motion under way early, if views observed since `next` returned it show an obstacle in its
         way. After the stop, call `next` again.
 
+        The stop is within the robot's limits of velocity, acceleration and jerk.
+
         Args:
             motion: The motion under way.
             time: When a new command takes effect: time since the start of the motion [s].
@@ -428,7 +396,27 @@ class Explorer:
                 f" {joined(self.robot.joint_names)}"
             )
         time = converted("time", Number, time)
-        return stop_before(self.robot, self.scene, self._news, self._free, motion, time)
+        if not 0 <= time <= motion.duration:
+            raise InputError(
+                f"time is {shown(time)}; it must be in [0, {motion.duration:.4g}] s of the motion"
+            )
+        robot = self.robot
+        current = motion.at(time).positions
+        end = motion.positions[-1]
+        seen = seen_shapes(self._news, robot, self.scene, current, end[None])
+        # points in space that was free before belong to an object that appeared; they are padded, since only
+        # the object's front is seen
+        points = np.concatenate([np.zeros((0, 3)), *(shape.points for shape in seen)])
+        new = points[MAP.enclose(self._free, points, MAP.edge)]
+        appeared = PointCloud(new, APPEARED_PADDING, name="appeared")
+        validator = verifier(Problem(robot, added(self.scene, [*seen, appeared]), current, end))
+        remaining = np.vstack([current, motion.positions[motion.times > time]])
+        violation = validator.path(Path(robot.joint_names, remaining)).violation
+        if violation is None:
+            return None
+        stop = braked(robot, motion, time)
+        certified = validator.collision_free(Path(robot.joint_names, stop.positions))
+        return Stop(time, stop, violation.message, certified)
 
     def _step(self, problem: Problem, policy: str) -> Step:
         if policy == STRICT and isinstance(problem.goal, JointGoal):
@@ -467,7 +455,7 @@ class Explorer:
         return self._keeps(motion, policy) and not self._goal_seen.missing(motion)
 
     def _go(self, motion: PlanResult, policy: str) -> Step:
-        stated = motion.confidence if policy == PROBABILISTIC else None
+        stated = motion.confidence  # None for strict motions
         free = "that stays in space seen free"
         if stated is not None:
             free = f"that is free with a probability of {stated:.3f}"
@@ -519,10 +507,9 @@ class Explorer:
         for look_policy in policies:
             look = self._way_to_look(problem, look_policy, to_view, predicted)
             if look is not None:
-                stated = look.confidence if look_policy == PROBABILISTIC else None
                 self._looked_for |= to_view
                 why += "; look at unseen space on the way"
-                return Step(LOOK, why, look_policy, look, stated, wanted=to_view)
+                return Step(LOOK, why, look_policy, look, look.confidence, wanted=to_view)
         back = self._way_back(problem) if STRICT in policies else None
         if back is not None:
             return Step(LOOK, f"{why}; go back on the way in and look from there", STRICT, back)

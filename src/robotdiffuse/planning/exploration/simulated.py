@@ -4,7 +4,7 @@ A RecordedExplorer keeps all views, occupancy maps and steps, for pictures, repl
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from robotdiffuse.core.types import (
     PlanResult,
     Pose,
     Trajectory,
+    frozen_dataclass,
 )
 from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 from robotdiffuse.perception.ray_caster import MAX_RANGE, looking_at, ray_cast
@@ -26,11 +27,10 @@ from robotdiffuse.planning.exploration.explorer import Explorer
 from robotdiffuse.planning.exploration.steps import LOOK, ArmCamera, ExplorerSettings, Step
 from robotdiffuse.problems.problem import Problem, is_given
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class RecordedView:
     """A view, and the occupancy map after it."""
 
@@ -49,7 +49,7 @@ class RecordedView:
         return ~(self.occupied | self.free)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class RecordedStep:
     """A step, and the state of the arm when it began."""
 
@@ -157,7 +157,7 @@ IMAGE_PERIOD = 0.25
 MAX_IMAGES = 8
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Event:
     """A step of `explore`, after its execution."""
 
@@ -204,7 +204,7 @@ def simulated_explorer(
     if ignored:
         names = ", ".join(ignored)
         raise InputError(f"the problem has {names}, which explore does not support: remove {names}")
-    known_scene = Scene([shape for shape in problem.scene.shapes if shape.name == FLOOR])
+    known_scene = problem.scene.with_shapes(shape for shape in problem.scene.shapes if shape.name == FLOOR)
     cameras = [wrist_camera(problem.robot)]
     explorer = RecordedExplorer(problem.robot, cameras, known_scene, FREE_ZONE, settings, seed)
     explorer.observe(camera_beside(problem, noise, seed))
@@ -262,12 +262,11 @@ def explore(
             yield Event(step, q)
             return
         path = step.motion.path
-        trajectory = step.motion.trajectory
         planned_problem = step.motion.problem
         true_problem = Problem(problem.robot, problem.scene, planned_problem.start, planned_problem.goal)
         violation = verify(true_problem, path).violation
-        if violation is None and trajectory is not None:
-            violation = verify_trajectory(true_problem, trajectory).violation
+        if violation is None:
+            violation = verify_trajectory(true_problem, step.motion.trajectory).violation
         for camera in explorer.cameras:
             for at in _image_configurations(step.motion):
                 explorer.observe(taken(problem, camera, at, noise, rng))
@@ -285,8 +284,6 @@ def explore(
 def _image_configurations(motion: PlanResult) -> Configurations:
     """The configurations of a motion at which images are taken; the last one is its end."""
     end = motion.path.positions[-1:]
-    if motion.trajectory is None:
-        return end
     duration = motion.trajectory.duration
     count = int(np.clip(duration / IMAGE_PERIOD, 1, MAX_IMAGES))
     times = duration * np.arange(1, count) / count

@@ -5,14 +5,14 @@ from typing import Annotated, Any, Literal
 
 from robotdiffuse.core.errors import InputError, positive, rigid_transform, shown, vector
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
-from robotdiffuse.core.types import Configurations, PlanResult, Pose, Poses, Value
+from robotdiffuse.core.types import Configurations, PlanResult, Pose, Poses, Value, frozen_dataclass
 from robotdiffuse.perception.depth_view import checked_intrinsics
 from robotdiffuse.perception.voxel_grid import Voxels
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class ArmCamera(Value):
     """A depth camera on a link of the arm. Attach the camera's body to the robot, so that it is checked for
     collisions."""
@@ -99,7 +99,7 @@ class ExplorerSettings(Settings, name="explorer"):
             )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Step:
     """What the arm shall do next."""
 

@@ -17,7 +17,6 @@ The space inside the surface needs no view, since obstacles do not float.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32
@@ -27,6 +26,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernel_arrays import reach_ball
 from robotdiffuse.collision.motions import search_space, with_covering_spheres
 from robotdiffuse.core.errors import InputError, check_type, rigid_transform
+from robotdiffuse.core.transforms import placed
 from robotdiffuse.core.types import (
     Configuration,
     Configurations,
@@ -37,6 +37,8 @@ from robotdiffuse.core.types import (
     Value,
     Values,
     Vector,
+    arc_lengths,
+    frozen_dataclass,
     interpolated,
 )
 from robotdiffuse.perception.depth_filter import MARGIN_SPREADS, filtered
@@ -139,9 +141,11 @@ def least_unknown(known: OccupancyMap, goals: Configurations) -> Configuration:
 
 
 def reaches_outside(robot: Robot, q: Configuration) -> bool:
-    """Whether the arm reaches out of the map: the centers of some of its covering spheres are outside."""
+    """Whether the arm reaches out of the map: the centers of some covering spheres of its moving links are
+    outside."""
     low, high = _corners_of_map()
-    centers = robot.placed_spheres(q)[:, :3]
+    moving = [link for link in robot.spheres if robot.link_frame(link)]
+    centers = np.concatenate([placed(robot.fk(q, link), robot.spheres[link][:, :3]) for link in moving])
     return bool(((centers < low) | (centers > high)).any())
 
 
@@ -151,18 +155,16 @@ def _corners_of_map() -> tuple[Vector, Vector]:
     return low, low + np.array(MAP.shape) * MAP.edge
 
 
-def _walls() -> list[Box]:
-    """Boxes around the map."""
+def _walls() -> Iterator[Box]:
+    """Yields boxes around the map."""
     low, high = _corners_of_map()
-    walls = []
     for axis in range(3):
         for at, name in ((low[axis] - WALL / 2, "before"), (high[axis] + WALL / 2, "beyond")):
             center = (low + high) / 2
             size = high - low + 2 * WALL
             center[axis] = at
             size[axis] = WALL
-            walls.append(Box(tuple(center), tuple(size), name=f"{name} the map, {'xyz'[axis]}"))
-    return walls
+            yield Box(center, size, name=f"{name} the map, {'xyz'[axis]}")
 
 
 BORDER = np.float32(1.0)
@@ -250,6 +252,8 @@ class GoalSeen:
         for view in views:
             assert view.configuration is not None  # the map takes no other views
             depth, _ = usable_image(view, self._robot, view.configuration, 0.0)
+            if view.range is not None:  # the sensor says nothing about farther space
+                depth = np.minimum(depth, np.float32(view.range))
             noise = MARGIN_SPREADS * filtered(view).edge_spread
             # balls that the arm contained; `see_through` adds those that the image sees through
             seen = self._distances(balls, view.configuration) < -BALL_RADIUS
@@ -328,7 +332,7 @@ def moved(robot: Robot, to: Configurations, others: Sequence[Configuration]) -> 
 
 def first_parts(waypoints: Configurations) -> Iterator[Configurations]:
     """Beginnings of a path, the shortest first and the whole path last."""
-    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1))])
+    at = arc_lengths(waypoints)
     for part in WAY_PARTS:
         end = part * at[-1]
         last = interpolated(end, at, waypoints)
@@ -426,11 +430,10 @@ def best_viewpoints(
 
     def scored(q: Configurations) -> Values:
         """The scores of configurations; 0 for configurations that see less than MIN_SEEN."""
-        on_arm = camera.intrinsics, (height, width), camera.range
-        seen = seen_share(robot, q, camera.poses(robot, q), *on_arm, *space)
+        poses = camera.poses(robot, q)
+        seen = seen_share(robot, q, poses, camera.intrinsics, (height, width), camera.range, *space)
         if fixed_view is not None:
             poses = np.tile(fixed_view.T_base_camera, (len(q), 1, 1))
-            image = fixed_view.intrinsics, fixed_view.depth.shape, np.inf
             seen_now = seen_share(robot, q, poses, *image, *space)
             seen = seen + np.maximum(seen_now - seen_at_start, 0.0)
         score = seen / (1 + np.linalg.norm(q - start, axis=1) / HALVING_DISTANCE)
@@ -473,7 +476,7 @@ MIN_PROBABILITY = 1e-3
 """Voxels less likely occupied than this are ignored."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class NextView(Value):
     """A camera pose, and how much it sees of the unknown space that a motion sweeps."""
 
@@ -554,8 +557,9 @@ def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None
     image = problem.views[0]
     q = np.tile(problem.start, (len(candidates), 1))
     size = image.depth.shape
+    reach = image.range or np.inf
     seen = seen_share(
-        problem.robot, q, np.stack(candidates), image.intrinsics, size, np.inf, at, weights, filled, FINE
+        problem.robot, q, np.stack(candidates), image.intrinsics, size, reach, at, weights, filled, FINE
     )
     best = int(seen.argmax())
     return NextView(candidates[best], float(seen[best]))

@@ -85,12 +85,13 @@ def _reached(came, clear, row, source, target, first, rows, begin, count):
             if can_wait and came[now + 1, i] == UNREACHED:
                 came[now + 1, i] = WAITED
         for m in range(len(source)):
-            arrival = now + first[m + 1] - first[m] - 1
+            steps = first[m + 1] - first[m] - 1
+            arrival = now + steps
             if came[now, source[m]] == UNREACHED or arrival >= ticks or came[arrival, target[m]] != UNREACHED:
                 continue
             # both configurations of each step must be free at both of its ticks
             free = True
-            for k in range(first[m + 1] - first[m] - 1):
+            for k in range(steps):
                 a = rows[first[m] + k]
                 b = rows[first[m] + k + 1]
                 if not (clear[a, now + k + 1] and clear[b, now + k] and clear[b, now + k + 1]):
@@ -265,4 +266,4 @@ def _timed(
         np.cumsum([0] + [len(of_motion) for of_motion in cells]),
         np.concatenate(cells),
     )
-    return graph.trajectory([graph.motions[m] if m >= 0 else m for m in motion_numbers]) if reached else None
+    return graph.trajectory(motion_numbers) if reached else None

@@ -31,7 +31,6 @@ from robotdiffuse.perception.depth_filter import measured_share
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.perception.observed_volume import ObservedVolume, merged, observe, observed_by
 from robotdiffuse.perception.occupancy_map import (
-    MAX_UNSEEN_SHARE,
     PADDINGS,
     THRESHOLDS,
     UNSEEN_CONFIDENCE,
@@ -133,7 +132,8 @@ def plan_with_unknown_space(
                 f"views[{i}]: {100 * (1 - share):.0f} % of the pixels measure nothing, which may lower the"
                 f" confidence{remedy if problem.views[i].cloud is None else ''}"
             )
-    attempts = _Attempts(planner, context, unknown, UNSEEN_CONFIDENCE if any(cameras) else 1.0)
+    unsure = any(cameras) or (policy == PREDICTED and policy_note)
+    attempts = _Attempts(planner, context, unknown, UNSEEN_CONFIDENCE if unsure else 1.0)
     as_seen = replace(problem, views=())
     limit = request.time_limit
     failed = list[str]()
@@ -170,15 +170,17 @@ def plan_with_unknown_space(
 
 
 def policy_for(problem: Problem) -> tuple[str, str]:
-    """The problem's policy for unknown space, or the default; and a note if the default policy padded is
-    used, otherwise ""."""
-    if problem.unknown is not None:
+    """The problem's policy for unknown space, or the default; and a note if the arm reaches farther than the
+    network predicts and the policy is predicted, or padded for this reason, otherwise ""."""
+    if problem.unknown not in (None, PREDICTED):
         return problem.unknown, ""
     from robotdiffuse.learning.completion import REACH, covers
 
     if covers(problem.robot):
         return PREDICTED, ""
     limitation = f"predicts up to {REACH:g} m from a Panda's shoulder; {problem.robot.name} reaches farther"
+    if problem.unknown == PREDICTED:
+        return PREDICTED, f"confidence is at most {UNSEEN_CONFIDENCE:g}, since the network {limitation}"
     return PADDED, f"unknown space: {PADDED}, since the network {limitation}"
 
 
@@ -318,10 +320,9 @@ class _Attempts:
         if not result.solved:
             return result
         crossed = self.unknown.crossed(result.path)
-        blind = "the views see hardly anything of the space that the motion crosses"
         return replace(
             result,
-            notes=(*result.notes, blind) if crossed.unseen_share > MAX_UNSEEN_SHARE else result.notes,
+            notes=(*result.notes, *filter(None, [crossed.blind])),
             assumption=assumption,
             confidence=min(confidence(assumption, crossed), self.max_confidence),
             swept_probability=crossed.risk,

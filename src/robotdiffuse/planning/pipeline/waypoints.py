@@ -331,17 +331,17 @@ def plan_from_start_velocity(planner: Solver, problem: Problem, request: PlanReq
     direction = velocity / np.linalg.norm(velocity)
     # how far the arm can move in this direction within its limits
     margin = np.where(direction > 0, robot.upper - problem.start, problem.start - robot.lower)
-    limited = (direction != 0) & ~np.array(robot.continuous)
+    limited = (direction != 0) & ~robot.continuous
     room = float((margin[limited] / np.abs(direction[limited])).min(initial=np.inf))
     stop = problem.start + stopping_distance(robot, context.timing, velocity, 0.9 * room) * direction
-    beyond = np.flatnonzero(((stop < robot.lower) | (stop > robot.upper)) & ~np.array(robot.continuous))
+    beyond = np.flatnonzero(robot.limit_excess(stop) > 0)
     if len(beyond):
         reason = f"{robot.joint_names[beyond[0]]} cannot stop from start_velocity within its limits"
         return context.fail(Status.INVALID_START, reason)
     result = planner.attempt(replace(problem, start=stop, start_velocity=None), request)
     if result.path is None:
         return replace(result, reason=f"planning from where the arm comes to rest: {result.reason}")
-    waypoints = np.concatenate([problem.start[None], result.path.positions])
+    waypoints = np.vstack([problem.start, result.path.positions])
     deviations = np.full(len(waypoints), TIMING.corner_deviation)
     deviations[2:] = result.corner_deviations[1:]
     verified_result = context.finish(waypoints, result.stage, notes=result.notes, deviations=deviations)

@@ -56,6 +56,9 @@ from robotdiffuse.core.types import (
     Trajectory,
     Values,
     Vector,
+    frozen_dataclass,
+    running_means,
+    spline_states,
 )
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.search.rrt import AnytimeSearch, SearchSettings
@@ -66,7 +69,13 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import MovingObstacle, added
 from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.trajectories import braking_kernel
-from robotdiffuse.trajectories.speed_limits import Jerk, TimingSettings, symmetric_bounds, timing_grid
+from robotdiffuse.trajectories.speed_limits import (
+    Jerk,
+    TimingSettings,
+    jerk_limits,
+    symmetric_bounds,
+    timing_grid,
+)
 from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.trajectories.timing_kernel import (
     RoundedLine,
@@ -102,7 +111,8 @@ class SpeedProfile(NamedTuple):
         """What remains of the motion at a time [s] after its beginning."""
         s, speed = states_at(self.s, self.speeds, np.array([time]))
         later = self.s > s + 1e-12
-        return SpeedProfile(np.append(s, self.s[later]), np.append(speed, self.speeds[later]))
+        # nothing remains: the arm rests, also if rounding leaves a speed
+        return SpeedProfile(np.append(s, self.s[later]), np.append(speed * later.any(), self.speeds[later]))
 
     @property
     def duration(self) -> float:
@@ -111,7 +121,7 @@ class SpeedProfile(NamedTuple):
         return float((2 * np.diff(self.s)[speed_sums > 0] / speed_sums[speed_sums > 0]).sum())
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class TimedPath:
     """A polyline with rounded corners that passed the validator; the arm need not stop before its end."""
 
@@ -168,6 +178,10 @@ class TimedPath:
         """The path's first and second derivatives on the grid, the grid of s, and the largest ṡ² on it."""
         count = max(int(self.line.length / LINE_INTERVAL), 8)
         grid = timing_grid(self.line, TimingSettings(line_intervals=count, corner_intervals=CORNER_INTERVALS))
+        # s̈ is constant in an interval, so an arm at rest in the last one could not start; it is divided until
+        # its last part is within the tolerance of `end`
+        parts = (grid[-1] - grid[-2]) * 0.5 ** np.arange(1, 26)
+        grid = np.concatenate([grid[:-1], grid[-1] - parts, grid[-1:]])
         path = self.line(grid, 1), self.line(grid, 2), grid
         bounds = symmetric_bounds(self.acceleration, len(grid))
         return *path, controllable(*path, VELOCITY_FRACTION * self.robot.velocity, *bounds)
@@ -192,7 +206,7 @@ class TimedPath:
         """The configuration at s and the waypoints after it, including those of the paths that follow."""
         waypoints = self.line.waypoints[self.line.knots > s + MIN_LENGTH]
         after = self.then.remaining(0.0)[1:] if self.then is not None else waypoints[:0]
-        return np.concatenate([self.at(s)[None], waypoints, after])
+        return np.vstack([self.at(s), waypoints, after])
 
     def positions(self, motion: SpeedProfile, times: Values) -> Configurations:
         """Configurations [n, dof] at times [s] after the beginning of a motion; at its end, the arm rests."""
@@ -280,21 +294,18 @@ class JerkFilter:
         times = step * np.arange(1, count + 1) - self._ago
         raw = np.concatenate([self._samples, path.positions(motion, times)])
         # averages of the differences from the last sample, so that rounding does not move the motion's end
-        total = np.cumsum(np.concatenate([0 * raw[:1], raw - raw[-1]]), axis=0)
-        points = (total[window:] - total[:-window]) / window
-        before = points[1:-3]
-        at = points[2:-2]
-        after = points[3:-1]
+        points = running_means(np.concatenate([0 * raw[:1], raw - raw[-1]]), window)
         # The first row is a fraction u of a step after a time of the grid. Rows of `powers`: powers of u, and
         # their first and second derivatives.
         powers = np.array([[1, u, u**2, u**3], [0, 1, 2 * u, 3 * u**2], [0, 0, 2, 6 * u]])
-        q, v, a = powers @ B_SPLINE @ points[:4]
+        first_q, first_v, first_a = powers @ B_SPLINE @ points[:4]
+        q, v, a = spline_states(points[1:-1], step)
         return Trajectory(
             self.joint_names,
             np.append(0.0, times),
-            raw[-1] + np.vstack([q, (before + 4 * at + after) / 6]),
-            np.vstack([v / step, (after - before) / (2 * step)]),
-            np.vstack([a / step**2, (after - 2 * at + before) / step**2]),
+            raw[-1] + np.vstack([first_q, q]),
+            np.vstack([first_v / step, v]),
+            np.vstack([first_a / step**2, a]),
         )
 
 
@@ -305,7 +316,7 @@ OBSERVATION_ERROR = 1e-3
 [m]."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class ObservedObstacle:
     """An obstacle as it was last seen."""
 
@@ -442,7 +453,7 @@ class ReplannerSettings(Settings, name="replanner"):
     stops much longer."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Command:
     """The motion that the arm shall execute."""
 
@@ -503,15 +514,15 @@ class Replanner:
         self._now = -np.inf
         self._searches = 0
         self._next: TimedPath | None = None
-        own_jerk = np.where(problem.robot.jerk > 0, problem.robot.jerk, np.inf)
-        jerk = own_jerk if settings.jerk is None else np.full(problem.robot.dof, settings.jerk)
+        jerk = jerk_limits(problem.robot, TimingSettings(jerk=settings.jerk), np.inf)
         self._filter = JerkFilter(problem.robot, jerk, settings.sample_time, problem.start)
         self._path, self._goals, self._space = self._first_path()
         # The current motion along the path, before the filter, and the time when it begins [s].
         self._since = -np.inf
         self._motion = AT_REST
-        self._must_leave = False
-        """Whether the path must be left where the current motion ends, because the goal has changed."""
+        self._must_leave = self._is_goal(problem.start)
+        """Whether the path must be left where the current motion ends, because the goal has changed, or
+        because the arm was at the goal from the start."""
         self._rehearse()
 
     def _rehearse(self) -> None:
@@ -599,12 +610,15 @@ class Replanner:
         """When the arm comes to rest [s]."""
         return self._since + (0.0 if self._rests else self._motion.duration + self._filter.lag)
 
+    def _is_goal(self, q: Configuration) -> bool:
+        off = self._goals - q
+        return bool(np.linalg.norm(off - self._robot.whole_turns(off), axis=1).min() < MIN_LENGTH)
+
     def _at_goal(self) -> bool:
         path = self._path
         s = self._motion.s[0]
         if self._must_leave:
-            off = self._goals - path.at(s)
-            return bool(np.linalg.norm(off - self._robot.whole_turns(off), axis=1).min() < MIN_LENGTH)
+            return self._is_goal(path.at(s))
         return bool(path.to_goal and path.then is None and s >= path.end)
 
     def _first_path(self) -> tuple[TimedPath, Configurations, Space]:
@@ -627,8 +641,7 @@ class Replanner:
             raise InputError(f"observation is {shown(observation)}; it must map names of obstacles to poses")
         for name in observation:
             check_name("obstacle in observation:", name, self._seen)
-        observations = {name: self._seen[name].again(value, now) for name, value in observation.items()}
-        self._seen |= observations
+        self._seen |= {name: self._seen[name].again(value, now) for name, value in observation.items()}
         self._now = now
         for name, observed in self._seen.items():
             if not np.isfinite(observed.time):
@@ -655,7 +668,7 @@ class Replanner:
         predicted to be free."""
         rest_time = self._rest_time
         rest = self._path.at(self._motion.s[-1])
-        next_path = self._path if self._next is None else self._next
+        next_path = self._next or self._path
         clear = self._path_clear(predicted, next_path, self._next is None)
         moving = not self._rests or self._motion.duration > 0
         leaves = self._must_leave and self._next is None
@@ -695,7 +708,7 @@ class Replanner:
             free = motions_free(search_space(checker, COARSE_RESOLUTION), old.astype(np.float32))
             old = old[1 + np.flatnonzero(~free).max(initial=0) :]
         roots = np.concatenate([self._goals, old[:-1]])
-        usable = checker.free(np.concatenate([start[None], roots]))
+        usable = checker.free(np.vstack([start, roots]))
         if not usable[0] or not usable[1:].any():
             return None
         clearance = min(float(predicted.margin.min()) + self.settings.clearance, MAX_CLEARANCE)

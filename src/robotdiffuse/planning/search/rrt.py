@@ -14,6 +14,7 @@ search: each path with the lowest estimated time so far is timed, and the call r
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Annotated
 
 import numpy as np
@@ -198,11 +199,12 @@ class AnytimeSearch:
         """The number of iterations (`work`) at which the current round ends."""
         self._grown: rrt_kernel.Trees | None = None
         """The trees that found the best path; before there is a path, those of the current round."""
-        self._clearances = clearances
+        self._later_clearances = list(clearances)
+        """Clearances that were not tried yet, falling [m]."""
         self._tries = tries
         self._stop = stop
         self._improved = improved
-        self._set_level(0)
+        self._set_clearance(self._later_clearances.pop(0))
 
     @classmethod
     def of(
@@ -235,11 +237,6 @@ class AnytimeSearch:
             stop=lambda: context.remaining <= 0,
             improved=context.improved,
         )
-
-    @property
-    def clearance(self) -> float:
-        """The distance to obstacles that paths keep, except near the start and the goals [m]."""
-        return self._clearances[self._level]
 
     @property
     def shortest(self) -> bool:
@@ -275,9 +272,9 @@ class AnytimeSearch:
         work_limit = self.work + work
         while self.best is None and self.work < work_limit and not self._stop():
             self._iterate()
-            lowest = self._level == len(self._clearances) - 1
-            if self.best is None and self._tried >= self._tries and not lowest:
-                self._set_level(self._level + 1)  # the trees keep a larger clearance, so they stay valid
+            if self.best is None and self._tried >= self._tries and self._later_clearances:
+                # the trees keep a larger clearance, so they stay valid
+                self._set_clearance(self._later_clearances.pop(0))
                 self._try_straight_lines()
         return self.best is not None
 
@@ -389,12 +386,13 @@ class AnytimeSearch:
         self._shortens = finer < self.settings.resolution
         self.settings = replace(self.settings, resolution=finer)
         self._set_best(accepted)
-        self._set_level(self._level)
+        self._set_clearance(self.clearance)
 
-    def _set_level(self, level: int) -> None:
-        self._level = level
+    def _set_clearance(self, clearance: float) -> None:
+        self.clearance = clearance
+        """The distance to obstacles that paths keep, except near the start and the goals [m]."""
         self._tried = 0
-        self.space = self.start_goal.space(self.settings.resolution, self.clearance)
+        self.space = self.start_goal.space(self.settings.resolution, clearance)
 
     def _try_straight_lines(self) -> None:
         if not self._shortens:
@@ -536,7 +534,7 @@ class _Validation:
             return False
         if motions is None or motions.best is None:
             return search.best is not self._path
-        return motions.best.time < (1 - MIN_TIME_GAIN) * _duration(self.best)
+        return motions.best.time < (1 - MIN_TIME_GAIN) * self.best.duration
 
     def run(self) -> bool:
         """Validate the fastest candidate if there is a valid result already, or if no time is left to search.
@@ -642,24 +640,16 @@ class _Validation:
     def _keep(self, result: PlanResult | None) -> None:
         """Make a result the best one if its motion is faster or, for the objective length, its path is
         shorter."""
-        cost = _duration if self.context.request.objective == TIME else _length
-        if result is not None and cost(result) < cost(self.best):
+        cost = attrgetter("duration" if self.context.request.objective == TIME else "path_length")
+        if result is not None and (self.best is None or cost(result) < cost(self.best)):
             self.best = result
-
-
-def _duration(result: PlanResult | None) -> float:
-    return np.inf if result is None or result.duration is None else result.duration
-
-
-def _length(result: PlanResult | None) -> float:
-    return np.inf if result is None or result.path_length is None else result.path_length
 
 
 def anytime(
     context: PlanningContext,
     search: AnytimeSearch,
     improves: Callable[[], bool],
-    improve: Callable[[], None],
+    step: int,
 ) -> PlanResult:
     """Search for a path, and then for better paths as long as the call's `until` requires.
 
@@ -667,7 +657,7 @@ def anytime(
         context: The planning call.
         search: Its search.
         improves: Whether more search is likely to shorten the path.
-        improve: Searches for shorter paths for a short time.
+        step: Number of iterations of the search for shorter paths between two checks of `improves`.
 
     Returns:
         The result with the best valid motion, or the failed result.
@@ -708,7 +698,7 @@ def anytime(
         else:
             searching = searches()
             if searching:
-                improve()
+                search.improve(step)
             if motions is not None:
                 after_search = motions.attempts + ATTEMPTS_AFTER_SEARCH
                 target = ATTEMPTS_PER_ITERATION * search.work if searching else after_search
@@ -757,7 +747,7 @@ class AORRTC(Planner[AORRTCSettings]):
             context,
             search,
             lambda: search.improves(settings.gain, settings.patience),
-            lambda: search.improve(IMPROVEMENT_STEP),
+            IMPROVEMENT_STEP,
         )
 
 
@@ -794,4 +784,4 @@ def plan_by_restarts(
     def improves() -> bool:
         return search.found < PATHS_TO_FIND or context.elapsed < context.first_path_at + optimize_time
 
-    return anytime(context, search, improves, lambda: search.improve(search.clock_interval))
+    return anytime(context, search, improves, search.clock_interval)

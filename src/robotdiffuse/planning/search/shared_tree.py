@@ -328,10 +328,10 @@ class SharedTreeSearch:
         """The best cost after each round [rad], infinite while there is no path."""
         self._longest = np.float32(settings.range)
         self._state = state
-        self._ends = np.concatenate([self.start[None], self.goals])
-        self._distances = falling_clearances(settings.safety_distance, checker, self._ends)
-        self._step = 0
-        self._enter_step()
+        self._ends = np.vstack([self.start, self.goals])
+        self._later_distances = falling_clearances(settings.safety_distance, checker, self._ends)
+        """Safety distances that were not tried yet, falling [m]."""
+        self._lower_distance()
 
     @property
     def goal_costs(self) -> Values:
@@ -370,8 +370,8 @@ class SharedTreeSearch:
                     return True
         elif (
             settings.improvement > 0
-            and self._step == len(self._distances) - 1
-            and self._rounds_at_step >= 3 * settings.step_rounds
+            and not self._later_distances
+            and self._rounds_at_distance >= 3 * settings.step_rounds
         ):
             # no path at any distance: give up after three times the usual number of rounds
             return True
@@ -393,18 +393,17 @@ class SharedTreeSearch:
             if path is not None:
                 self._graft(path, self.best_goal)
         self.costs.append(self.cost)
-        self._rounds_at_step += 1
-        last = self._step == len(self._distances) - 1
-        if self.best_goal < 0 and not last and self._rounds_at_step >= settings.step_rounds:
-            self._step += 1
-            self._enter_step()
+        self._rounds_at_distance += 1
+        tried = self._rounds_at_distance >= settings.step_rounds
+        if self.best_goal < 0 and self._later_distances and tried:
+            self._lower_distance()
 
-    def _enter_step(self) -> None:
-        """Set the safety distance of the step, and add straight paths to goals that are free at this
+    def _lower_distance(self) -> None:
+        """Go on with the next safety distance, and add straight paths to goals that are free at this
         distance. The tree stays valid, since safety distances only fall."""
-        self.safety_distance = self._distances[self._step]
+        self.safety_distance = self._later_distances.pop(0)
         """Distance to obstacles that paths keep, except near a start or goal that is closer to them [m]."""
-        self._rounds_at_step = 0
+        self._rounds_at_distance = 0
         self._space = padded_space(self.checker, self._ends, self.settings.resolution, self.safety_distance)
         for g, goal in enumerate(self.goals):
             line = np.stack([self.start, goal])

@@ -13,7 +13,7 @@ import numpy as np
 from robotdiffuse.collision.kernels.motions import Space, make_scratch, motion_free
 from robotdiffuse.collision.kernels.random import random, random_state
 from robotdiffuse.core.kernels import inner_kernel, kernel
-from robotdiffuse.core.types import Configuration, Configurations, Values
+from robotdiffuse.core.types import Configuration, Configurations, Values, step_lengths
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.speed_limits import TimingSettings, least_time, scaled_limits
 from robotdiffuse.trajectories.straight_line import straight_line_time
@@ -219,7 +219,7 @@ class Candidate:
     @property
     def length(self) -> float:
         """Length of the path [rad, joint-space L2]."""
-        return float(np.linalg.norm(np.diff(self.path, axis=0), axis=1).sum())
+        return float(step_lengths(self.path).sum())
 
 
 class TimeOptimization:

@@ -1,7 +1,7 @@
 """Family: the protocol of random problem generators, and how they sample starts and goals."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -13,7 +13,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Natural, Positive, Settings
 from robotdiffuse.core.transforms import moved_spheres
-from robotdiffuse.core.types import Configuration, Configurations, JointRows, Mask, Pose
+from robotdiffuse.core.types import Configuration, Configurations, JointRows, Mask, Pose, frozen_dataclass
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.robot import Robot
@@ -62,7 +62,7 @@ MIN_POSE_DOF = 6
 POSITION_IK = replace(POSE_IK, position_only=True)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class SampledProblem:
     """A random problem. All of its goals bring the tip to the same target."""
 

@@ -10,16 +10,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Annotated
 
 import numpy as np
 from numpy.random import Generator
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Share
+from robotdiffuse.core.settings import AtLeastTwo, Count, Natural, NotNegative, Positive, Share
 from robotdiffuse.core.transforms import rotation_about, rotation_z_to, transform
-from robotdiffuse.core.types import Pose, Values, Vector
+from robotdiffuse.core.types import Pose, Values, Vector, frozen_dataclass
 from robotdiffuse.problems.families.family import (
     CONFIGURATION,
     NaturalRange,
@@ -70,10 +69,9 @@ DRAWER_SHAPES = 5
 """Number of boxes that make up a drawer."""
 Cell = tuple[float, float, float, float]
 """A compartment: y of its right and left side, z of its bottom and top, in the furniture's frame [m]."""
-AtLeastTwo = Annotated[int, Bound(least=2.0)]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class Region:
     """A box without obstacles, rotated about the vertical axis, for the fingers at start or goal."""
 
@@ -87,7 +85,7 @@ class Region:
     """Unit vector of the hand's direction, in the base frame: away from the arm, or down."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class FurnishedScene:
     """A scene and its regions, at least two."""
 

@@ -20,6 +20,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 
 from robotdiffuse.core.kernels import kernel
+from robotdiffuse.core.transforms import scaled_normals
 from robotdiffuse.core.types import Points, Values, Vector
 from robotdiffuse.robots.bodies import ConvexMesh, Surface
 from robotdiffuse.robots.fitting.triangles import Triangles, split
@@ -37,8 +38,7 @@ def convex_hull(points: Points) -> ConvexMesh:
     used, index = np.unique(hull.simplices, return_inverse=True)
     vertices = points[used]
     faces = index.reshape(hull.simplices.shape)
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    inwards = np.einsum("fd,fd->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    inwards = np.einsum("fd,fd->f", scaled_normals(vertices[faces]), hull.equations[:, :3]) < 0
     faces[inwards] = faces[inwards][:, ::-1]
     return ConvexMesh(vertices, faces)
 
@@ -54,8 +54,7 @@ def thickened(points: Points) -> Points:
 
 def face_normals(mesh: ConvexMesh) -> Points:
     """Outward unit normals of the faces that have an area."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    normals = np.cross(b - a, c - a)
+    normals = scaled_normals(mesh.vertices[mesh.faces])
     size = np.linalg.norm(normals, axis=1, keepdims=True)
     return (normals / np.maximum(size, 1e-14))[size[:, 0] > 1e-14]
 
@@ -206,7 +205,7 @@ def convex_parts(
 
     Near `tight` places [n, 3], in the link's frame [m], the meshes stick out less.
     """
-    soups = [surface.vertices[surface.faces] for surface in surfaces]
+    soups = [surface.triangles for surface in surfaces]
     finer = 1 if tight is None else 2
     space = DistanceGrid.around(soups, finer**3 * settings.voxels, settings.finest / finer)
     parts = [Part.of(soup, _spread(soup, space.pitch), space, settings) for soup in soups]

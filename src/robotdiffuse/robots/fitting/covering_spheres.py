@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial import ConvexHull, QhullError
 
-from robotdiffuse.core.transforms import inverse, moved_spheres, placed
+from robotdiffuse.core.transforms import ball_around, inverse, moved_spheres, placed
 from robotdiffuse.core.types import Points, Rotation, Spheres, Values, Vector
 from robotdiffuse.robots.bodies import AttachedBody, ConvexMesh
 from robotdiffuse.robots.fitting.sphere_fitting import MARGIN, SphereSettings
@@ -39,14 +39,14 @@ def cover(mesh: ConvexMesh) -> Spheres:
     vertices = mesh.vertices @ axes.T
     low = vertices.min(axis=0)
     high = vertices.max(axis=0)
+    inradius = float((high - low).min()) / 2
+    tolerance = LINK_TOLERANCES.tolerance(*HAND, inradius)
     bounding = _around(vertices)
-    if bounding[3] - (high - low).min() / 2 <= LINK_TOLERANCES.tolerance(
-        *HAND, float((high - low).min()) / 2
-    ):
+    if bounding[3] - inradius <= tolerance:
         spheres = bounding[None]
     else:
         pieces = [vertices]
-        for axis, count in enumerate(_lattice(high - low)):
+        for axis, count in enumerate(_lattice(high - low, tolerance)):
             cuts = np.linspace(low[axis], high[axis], count + 1)[1:-1]
             pieces = [slab for piece in pieces for slab in _slices(piece, axis, cuts)]
         spheres = np.stack([_around(piece) for piece in pieces if len(piece)])
@@ -62,16 +62,14 @@ def _axes(vertices: Points) -> Rotation:
     return principal if principal_volume < 0.9 * frame_volume else np.eye(3)
 
 
-def _lattice(size: Vector) -> tuple[int, ...]:
+def _lattice(size: Vector, tolerance: float) -> tuple[int, ...]:
     """Number of pieces along each axis: the fewest pieces with spheres within the tolerance. If MAX_SPHERES
     pieces do not suffice, the numbers with which the spheres stick out least."""
-    counts = np.stack(
-        np.meshgrid(*3 * [np.arange(1, MAX_PIECES_PER_AXIS + 1)], indexing="ij"), axis=-1
-    ).reshape(-1, 3)
+    counts = np.indices(3 * [MAX_PIECES_PER_AXIS]).reshape(3, -1).T + 1
     counts = counts[counts.prod(axis=1) <= MAX_SPHERES]
     half = size / counts / 2
     stick_out = np.linalg.norm(half, axis=1) - half.min(axis=1)
-    close = np.flatnonzero(stick_out <= LINK_TOLERANCES.tolerance(*HAND, float(size.min()) / 2))
+    close = np.flatnonzero(stick_out <= tolerance)
     best = close[counts[close].prod(axis=1).argmin()] if len(close) else stick_out.argmin()
     return tuple(counts[best].tolist())
 
@@ -104,7 +102,7 @@ def _outermost(points: Points, axis: int) -> Points:
 def _around(points: Points) -> Float[ndarray, "4"]:
     """A small sphere around points. Centers are tried from the center of the points' box on, by Badoiu and
     Clarkson's algorithm; the smallest sphere found is returned."""
-    center = (points.min(axis=0) + points.max(axis=0)) / 2
+    center, _ = ball_around(points)
     best = np.array([*center, np.inf])
     for i in range(1, BOUNDING_STEPS):
         distances = np.linalg.norm(points - center, axis=1)

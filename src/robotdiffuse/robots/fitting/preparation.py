@@ -23,6 +23,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, check_name, joined, shown
 from robotdiffuse.core.files import lock_folder
+from robotdiffuse.core.transforms import seen_from
 from robotdiffuse.core.types import Mask, Points, Poses, Spheres
 from robotdiffuse.robots.bodies import Surface
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, convex_parts
@@ -48,7 +49,6 @@ from robotdiffuse.robots.fitting.sphere_fitting import (
     stacked_planes,
     stick_out,
 )
-from robotdiffuse.robots.kinematic_tree import MOVING_KINDS
 from robotdiffuse.robots.parsing.srdf import read_srdf
 from robotdiffuse.robots.parsing.urdf import UrdfTree, read_limits
 from robotdiffuse.robots.robot import Robot
@@ -90,14 +90,14 @@ def neighbors(robot: Robot, link: str) -> tuple[Neighbor, ...]:
         T_above_parent = np.eye(4)
         while above not in robot.meshes and above != robot.base:
             through = robot.joints_above(above)[-1]
-            if through.kind in MOVING_KINDS:
+            if through.movable:
                 break
             above = through.parent
             T_above_parent = through.T_parent_joint @ T_above_parent
         if link not in (above, joint.child) or not {above, joint.child} <= set(robot.meshes):
             continue
         ends = (-np.pi, np.pi) if joint.kind == "continuous" else (joint.lower, joint.upper)
-        values = np.linspace(*ends, JOINT_SAMPLES) if joint.kind in MOVING_KINDS else [0.0]
+        values = np.linspace(*ends, JOINT_SAMPLES) if joint.movable else [0.0]
         T = T_above_parent @ joint.T_parent_joint @ joint.motion(values)
         adjacent.append(Neighbor(joint.child, T) if link == above else Neighbor(above, np.linalg.inv(T)))
     return tuple(adjacent)
@@ -117,7 +117,7 @@ def hidden_by_neighbors(robot: Robot, link: str) -> Callable[[Points], Mask]:
         for near_link, (low, high), planes in neighbor_planes:
             candidates = np.flatnonzero(~hidden_points)
             for T in near_link.T_link_neighbor:
-                local = (points[candidates] - T[:3, 3]) @ T[:3, :3]
+                local = seen_from(T, points[candidates])
                 in_box = ((local >= low) & (local <= high)).all(axis=1)
                 candidates = candidates[in_box]
                 local = local[in_box]
@@ -143,7 +143,7 @@ def with_grazing_links(
 def _joined(surfaces: Iterable[Surface]) -> Surface:
     """One surface with equal vertices merged, so that its connected components can be found. Coordinates are
     rounded to float32, as they are stored."""
-    corners = np.concatenate([surface.vertices[surface.faces].reshape(-1, 3) for surface in surfaces])
+    corners = np.concatenate([surface.triangles.reshape(-1, 3) for surface in surfaces])
     vertices, index = np.unique(corners.astype(np.float32), axis=0, return_inverse=True)
     faces = index.reshape(-1, 3)
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
@@ -385,18 +385,17 @@ def with_finer_parts(
 
     Starts and goals often have such false collisions, when an arm rests close to its own body.
     """
-    places: dict[str, list[ndarray]] = {}
+    changed = set[str]()
     for pair in false_collisions.pairs:
-        for name in pair.links:
-            if len(pair.coarse[name]):
-                places.setdefault(name, []).append(pair.coarse[name])
-    if not places:
+        for name, places in pair.coarse.items():
+            if len(places):
+                links[name].tight = np.concatenate([links[name].tight, places])
+                changed.add(name)
+    if not changed:
         return None
-    for name in sorted(places):
-        link = links[name]
-        link.tight = np.concatenate([link.tight, *places[name]])
-        robot = link.fit(link.decompose(robot), settings.spheres, seed)
-    return _with_tables(robot, set(), set(places), settings)
+    for name in sorted(changed):
+        robot = links[name].fit(links[name].decompose(robot), settings.spheres, seed)
+    return _with_tables(robot, set(), changed, settings)
 
 
 def _with_tables(

@@ -21,12 +21,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.transforms import ball_around
+from robotdiffuse.core.transforms import ball_around, placed_each, seen_from
 from robotdiffuse.core.types import Configurations, Mask, Points, Poses, Spheres, Values, Vector, for_kernels
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose, coal_surface
 from robotdiffuse.robots.fitting.convex_parts import Surface, one_per_cube
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import ball_distances, deepest_touches
-from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, TURN, Joint, with_mimics
+from robotdiffuse.robots.kinematic_tree import TURN, Joint, with_mimics
 from robotdiffuse.robots.motion_bounds import radii_of
 from robotdiffuse.robots.robot import LinkPairTable, Robot, moving_pairs
 
@@ -46,6 +46,9 @@ NEAR_DISTANCE = 0.1
 """For pairs of links that are farther apart than this in all samples, fewer searches for a collision are made
 [m]."""
 
+LinkPoses = dict[str, Poses]
+"""T_base_link in n configurations, by link."""
+
 
 class Links:
     """Poses of all links for batches of values of all movable joints, and collision tests of pairs of
@@ -54,7 +57,7 @@ class Links:
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
         names = {joint.name for joint in robot.joints}
-        movable = [joint for joint in robot.joints if joint.kind in MOVING_KINDS]
+        movable = [joint for joint in robot.joints if joint.movable]
         # a joint that mimics one above the base moves by itself
         self.joints = [j for j in movable if j.mimic is None or j.mimic.joint not in names]
         self.lower = np.array([joint.lower for joint in self.joints])
@@ -100,7 +103,7 @@ class Links:
             and unexplained < MAX_UNEXPLAINED * variance
         )
 
-    def poses(self, q: Configurations, wanted: Iterable[str] = ()) -> dict[str, Poses]:
+    def poses(self, q: Configurations, wanted: Iterable[str] = ()) -> LinkPoses:
         """T_base_link [n, 4, 4] by link. With `wanted` links, only the poses of these links and of the links
         on the way to them."""
         chains = [self.robot.joints_above(link) for link in wanted or self.robot.link_names]
@@ -109,29 +112,29 @@ class Links:
         values = with_mimics(self.robot.joints, {joint.name: q[:, i] for i, joint in enumerate(self.joints)})
         for joint in joints:
             T_parent_child = joint.T_parent_joint
-            if joint.kind in MOVING_KINDS:
+            if joint.movable:
                 T_parent_child = T_parent_child @ joint.motion(values[joint.name])
             poses[joint.child] = poses[joint.parent] @ T_parent_child
         return poses
 
-    def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Values:
+    def sphere_distance(self, poses: LinkPoses, a: str, b: str) -> Values:
         """Signed distances [n] between the covering spheres of two links [m]: lower bounds of the distances
         of the links' meshes. Where the bounding balls of the links' spheres are more than NEAR_DISTANCE
         apart, the distance of these two balls is given."""
         first, second = (for_kernels(self.robot.spheres[link]) for link in (a, b))
         return -deepest_touches(poses[a], poses[b], first, second, NEAR_DISTANCE, -np.inf)[0]
 
-    def _placed(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> tuple[Any, Any, ndarray]:
+    def _placed(self, poses: LinkPoses, a: str, b: str, i: int) -> tuple[Any, Any, ndarray]:
         """Coal poses of two links in configuration i, and the distances [a, b] between the balls around their
         parts [m]."""
         ball_gaps = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
         return coal_pose(poses[a][i]), coal_pose(poses[b][i]), ball_gaps
 
-    def collide(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> bool:
+    def collide(self, poses: LinkPoses, a: str, b: str, i: int) -> bool:
         """Whether convex parts of two links collide in configuration i."""
         return any(True for _ in self.contacts(poses, a, b, i))
 
-    def contacts(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> Iterator[Vector]:
+    def contacts(self, poses: LinkPoses, a: str, b: str, i: int) -> Iterator[Vector]:
         """Points where convex parts of two links overlap in configuration i, one for each overlapping pair of
         parts [m], in the base frame."""
         T_a, T_b, ball_gaps = self._placed(poses, a, b, i)
@@ -140,7 +143,7 @@ class Links:
             if coal.collide(self.hulls[a][m], T_a, self.hulls[b][n], T_b, self.request, self.result):
                 yield np.array(self.result.getContact(0).pos)
 
-    def mesh_distance(self, poses: dict[str, ndarray], a: str, b: str, i: int = 0) -> float:
+    def mesh_distance(self, poses: LinkPoses, a: str, b: str, i: int = 0) -> float:
         """Distance between the convex parts of two links in configuration i [m]; zero or less if they
         collide."""
         T_a, T_b, ball_gaps = self._placed(poses, a, b, i)
@@ -154,7 +157,7 @@ class Links:
 
     def part_distances(
         self,
-        poses: dict[str, ndarray],
+        poses: LinkPoses,
         a: str,
         b: str,
         rows: Int[ndarray, "n"],
@@ -166,8 +169,7 @@ class Links:
         lower bound that is also above `limit`."""
         balls = [self.balls[link][parts[k]] for k, link in enumerate((a, b))]
         middles = [
-            np.einsum("nij,nj->ni", poses[link][rows, :3, :3], ball[:, :3]) + poses[link][rows, :3, 3]
-            for link, ball in zip((a, b), balls, strict=True)
+            placed_each(poses[link][rows], ball[:, :3]) for link, ball in zip((a, b), balls, strict=True)
         ]
         part_gaps = np.linalg.norm(middles[0] - middles[1], axis=1) - balls[0][:, 3] - balls[1][:, 3]
         for k in np.flatnonzero(part_gaps <= limit):
@@ -194,14 +196,15 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
     other from the center of the box to any of its points. The cells of such a box count as colliding unless
     they are proven free.
     """
-    joints = robot.joints_between(*pair)
+    joints = list(robot.joints_between(*pair))
+    names = tuple(robot.joint_names[joint] for joint in joints)
     far = max(pair, key=robot.link_frame)
-    lever = radii_of(robot, [far])[0, list(joints)]
-    slides = np.array(robot.prismatic)[list(joints)]
-    lower = robot.lower[list(joints)]
-    upper = robot.upper[list(joints)]
+    lever = radii_of(robot, [far])[0, joints]
+    slides = np.array(robot.prismatic)[joints]
+    lower = robot.lower[joints]
+    upper = robot.upper[joints]
     upper = np.where(slides, upper, np.minimum(upper, lower + TURN))
-    columns = [[j.name for j in links.joints].index(robot.joint_names[joint]) for joint in joints]
+    columns = [[j.name for j in links.joints].index(name) for name in names]
     nominal = links.named({})
     edge = (upper - lower) / CELLS
     # Boxes of joint values, in units of the table's cells. All boxes have the same `size`, which is halved
@@ -234,7 +237,6 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
             is_open = separated[tuple(_cells(low, size)[0].T)]
             low = low[is_open]
             parts = parts[:, is_open]
-    names = tuple(robot.joint_names[joint] for joint in joints)
     return LinkPairTable(pair, names, tuple(lower.tolist()), tuple(upper.tolist()), separated)
 
 
@@ -395,13 +397,13 @@ def _own_between(robot: Robot, a: str, b: str, max_locked: int) -> list[Joint] |
         planned = [joint for joint in above[link] if joint in robot.planned_joints][:1]
         carried = above[link][: above[link].index(planned[0])] if planned else above[link]
         tool = robot.at_end(link) and above[link][:1] != planned
-        return not tool and sum(joint.kind in MOVING_KINDS for joint in carried) <= max_locked
+        return not tool and sum(joint.movable for joint in carried) <= max_locked
 
     above = {link: robot.joints_above(link)[::-1] for link in (a, b)}
     if not own(a) or not own(b):
         return None
-    chain_joints = {joint.name: joint for joint in (*above[a], *above[b])}.values()
-    return [j for j in chain_joints if (j in above[a]) != (j in above[b]) and j.kind in MOVING_KINDS]
+    chain_joints = dict.fromkeys((*above[a], *above[b]))
+    return [j for j in chain_joints if (j in above[a]) != (j in above[b]) and j.movable]
 
 
 def _adjacent(robot: Robot) -> set[frozenset[str]]:
@@ -525,7 +527,7 @@ def measure_false_collisions(
         gaps = all_gaps[far_enough]
         T_base_a = poses[a][false_spheres]
         T_base_b = poses[b][false_spheres]
-        at = np.einsum("nij,nj->ni", T_base_a[:, :3, :3], middle[false_spheres]) + T_base_a[:, :3, 3]
+        at = placed_each(T_base_a, middle[false_spheres])
         on_b = np.einsum("nji,nj->ni", T_base_b[:, :3, :3], at - T_base_b[:, :3, 3])
         places = {a: _narrowest_per_cube(middle[false_spheres], gaps), b: _narrowest_per_cube(on_b, gaps)}
         false_parts = np.flatnonzero(parts & ~meshes & free)[:MAX_PART_CASES]
@@ -541,7 +543,7 @@ def measure_false_collisions(
 def _sticking_out(
     links: Links,
     trees: Mapping[str, tuple["coal.BVHModelOBBRSS", ...]],
-    poses: dict[str, ndarray],
+    poses: LinkPoses,
     pair: tuple[str, str],
     rows: Int[ndarray, "n"],
 ) -> dict[str, Points]:
@@ -563,8 +565,7 @@ def _sticking_out(
                 for link, place in ((link, coal_pose(poses[link][i])) for link in pair)
             ]
             link = pair[int(np.argmax(far))]
-            T = poses[link][i]
-            places_by_link[link].append((at - T[:3, 3]) @ T[:3, :3])
+            places_by_link[link].append(seen_from(poses[link][i], at))
     return {link: np.reshape(places, (-1, 3)) for link, places in places_by_link.items()}
 
 

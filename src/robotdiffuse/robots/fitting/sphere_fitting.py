@@ -199,9 +199,8 @@ def _distance_inside(
 def stacked_planes(meshes: tuple[ConvexMesh, ...]) -> Planes:
     """Normals and offsets of the face planes of all meshes, and the index where each mesh's planes start,
     with their total number last."""
-    planes = [planes_of(mesh) for mesh in meshes]
-    starts = np.cumsum([0, *(len(offsets) for _, offsets in planes)])
-    return np.concatenate([normals for normals, _ in planes]), np.concatenate([o for _, o in planes]), starts
+    normals, offsets = zip(*map(planes_of, meshes), strict=True)
+    return np.concatenate(normals), np.concatenate(offsets), np.cumsum([0, *map(len, offsets)])
 
 
 def is_inside(points: Points, planes: Planes, depth: float) -> Mask:
@@ -307,7 +306,7 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Spheres) -> bool:
     (True), a corner is outside all spheres, or a triangle is smaller than SMALLEST_TRIANGLE (False).
     Triangles and corners inside another mesh are ignored, since they are not on the surface.
     """
-    triangles = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
+    triangles = np.concatenate([mesh.triangles for mesh in meshes])
     spheres = for_kernels(spheres)
     mesh_planes = [stacked_planes((mesh,)) for mesh in meshes] if len(meshes) > 1 else []
     while len(triangles):
@@ -352,7 +351,7 @@ class Cells(NamedTuple):
         to the triangles of the meshes.
         """
         size = _disc(bounds.tolerance, solid.depth) / cut
-        corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in solid.meshes])
+        corners = np.concatenate([mesh.triangles for mesh in solid.meshes])
         area = np.linalg.norm(np.cross(*np.diff(corners, axis=1).swapaxes(0, 1)), axis=1).sum() / 2
         ratio = area / size**2 / most
         if ratio > MAX_CELL_RATIO:
@@ -362,7 +361,7 @@ class Cells(NamedTuple):
         irregular = False
         planes = [stacked_planes((mesh,)) for mesh in solid.meshes]
         for k, mesh in enumerate(solid.meshes):
-            triangles = split(mesh.vertices[mesh.faces], size)
+            triangles = split(mesh.triangles, size)
             hidden = np.zeros(len(triangles), dtype=bool)
             for mesh_planes in (*planes[:k], *planes[k + 1 :]):
                 hidden |= is_inside(triangles.reshape(-1, 3), mesh_planes, BURIED_DEPTH).reshape(-1, 3).all(1)

@@ -21,10 +21,10 @@ from numpy import ndarray
 from robotdiffuse.core.errors import MAX_WORD, InputError, needs, shortened, shown
 from robotdiffuse.core.transforms import (
     inverse,
-    quaternion_from_rotation,
     rotation_about,
     rotation_from_quaternion,
     transform,
+    xyzw_of,
 )
 from robotdiffuse.core.types import Mask, Pose, Values, Vector
 from robotdiffuse.robots.fitting.convex_parts import convex_hull
@@ -159,12 +159,6 @@ class ConvertedModel:
             return f"{label}_" if named(label).id != index else label
         return label
 
-    def joint_name(self, joint: int) -> str:
-        return self.name("joint", joint)
-
-    def joint_kind(self, joint: int) -> str:
-        return kind_of("Joint", self.model.jnt_type[joint])
-
     def _element(self, name: str, kind: str, parent: str, child: str, T: Pose) -> ET.Element:
         """Adds a joint to the URDF; T is T_parent_joint."""
         joint = ET.SubElement(self.root, "joint", name=name, type=kind)
@@ -187,8 +181,8 @@ class ConvertedModel:
         T = _pose(model.body_pos[body], model.body_quat[body])
         joints = _joints_of(model, [body])
         for joint in joints:
-            label = self.joint_name(joint)
-            kind = self.joint_kind(joint)
+            label = self.name("joint", joint)
+            kind = kind_of("Joint", model.jnt_type[joint])
             if joint in self.held:
                 slide = f"slide joint {label}, which has no range,"
                 held = slide if kind == "slide" else f"the free joint of {name}"
@@ -197,7 +191,14 @@ class ConvertedModel:
             if kind == "ball":
                 raise InputError(f"{self.path}: joint {label} is a ball joint; use three hinges in its place")
             anchor = transform(model.jnt_pos[joint])
-            reference = self._moved(joint, -float(model.qpos0[model.jnt_qposadr[joint]]))
+            # the pose of the joint at the value 0, seen from its pose at the value in `qpos0`
+            axis = model.jnt_axis[joint]
+            value = -float(model.qpos0[model.jnt_qposadr[joint]])
+            reference = (
+                transform(value * axis)
+                if kind == "slide"
+                else transform(np.zeros(3), rotation_about(axis, value))
+            )
             last = joint == joints[-1] and np.linalg.norm(model.jnt_pos[joint]) < MIN_SHIFT
             child = name if last else f"{label}_anchor"
             if not last:
@@ -209,17 +210,10 @@ class ConvertedModel:
             self._element(f"{name}_fixed", "fixed", above, name, T)
         self._geometry(self._link(name), body)
 
-    def _moved(self, joint: int, value: float) -> Pose:
-        """The transform by which a joint moves for a value [rad] or [m]."""
-        axis = self.model.jnt_axis[joint]
-        if self.joint_kind(joint) == "slide":
-            return transform(value * axis)
-        return transform(np.zeros(3), rotation_about(axis, value))
-
     def _joint(self, joint: int, parent: str, child: str, T: ndarray) -> None:
         model = self.model
-        label = self.joint_name(joint)
-        slides = self.joint_kind(joint) == "slide"
+        label = self.name("joint", joint)
+        slides = kind_of("Joint", model.jnt_type[joint]) == "slide"
         limited = model.jnt_limited[joint]
         if slides and not limited:
             raise InputError(f"{self.path}: slide joint {label} has no range; give it one")
@@ -275,7 +269,7 @@ class ConvertedModel:
                 continue
             start = model.qpos0[model.jnt_qposadr[[follower, leader]]]
             mimics[follower] = {
-                "joint": self.joint_name(leader),
+                "joint": self.name("joint", leader),
                 "multiplier": repr(slope),
                 "offset": repr(float(start[0] + offset - slope * start[1])),
             }
@@ -292,7 +286,7 @@ class ConvertedModel:
             ET.SubElement(inertial, "mass", value=repr(float(model.body_mass[body])))
             xx, yy, zz = map(repr, model.body_inertia[body].tolist())
             ET.SubElement(inertial, "inertia", ixx=xx, iyy=yy, izz=zz, ixy="0", ixz="0", iyz="0")
-        for geom in _geoms_of(model, body):
+        for geom in np.flatnonzero(model.geom_bodyid == body).tolist():
             if not self.colliding[geom] and kind_of("Geom", model.geom_type[geom]) not in GEOMS:
                 continue
             element = ET.SubElement(link, "collision" if self.colliding[geom] else "visual")
@@ -357,7 +351,8 @@ class ConvertedModel:
         )
         unfiltered = bool(model.opt.disableflags & imported_mujoco().mjtDisableBit.mjDSBL_FILTERPARENT)
         geoms = {
-            body: [geom for geom in _geoms_of(model, body) if self.colliding[geom]] for body in self.bodies
+            body: np.flatnonzero((model.geom_bodyid == body) & self.colliding).tolist()
+            for body in self.bodies
         }
         solid = [body for body in self.bodies if geoms[body]]
 
@@ -384,7 +379,7 @@ class ConvertedModel:
                 name = f"qpos of keyframe {self.name('key', k)}"
                 raise InputError(f"{self.path}: {name} is {shown(qpos)}; its numbers must be finite")
         places = {
-            self.joint_name(joint): model.jnt_qposadr[joint]
+            self.name("joint", joint): model.jnt_qposadr[joint]
             for joint in _joints_of(model, self.bodies)
             if joint not in self.held
         }
@@ -409,10 +404,6 @@ def ellipsoid(radii: Vector) -> trimesh.Trimesh:
     return ball
 
 
-def _geoms_of(model: Any, body: int) -> list[int]:
-    return np.flatnonzero(model.geom_bodyid == body).tolist()
-
-
 def _related(model: Any, first: int, second: int, unfiltered: bool) -> bool:
     """Whether two bodies are rigidly connected, or one is the parent of the other. Rigidly connected bodies
     count as one body, and bodies fixed to the world are no parents. `unfiltered`: whether the model lets a
@@ -428,8 +419,7 @@ def _pose(xyz: Vector, wxyz: Float[ndarray, "4"]) -> Pose:
 
 
 def _origin(element: ET.Element, T: Pose) -> None:
-    w, x, y, z = quaternion_from_rotation(T[:3, :3])
-    ET.SubElement(element, "origin", xyz=_text(T[:3, 3]), quat_xyzw=_text(np.array([x, y, z, w])))
+    ET.SubElement(element, "origin", xyz=_text(T[:3, 3]), quat_xyzw=_text(xyzw_of(T)))
 
 
 def _text(numbers: Values) -> str:

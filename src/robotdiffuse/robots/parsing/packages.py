@@ -5,7 +5,7 @@ import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from urllib.parse import unquote
 
 from robotdiffuse.core.errors import MAX_WORD, InputError, shortened, shown
@@ -41,13 +41,13 @@ class Packages(NamedTuple):
             return Path(self.folders[name])
         ros = _folders("ROS_PACKAGE_PATH")
         ament = _folders("AMENT_PREFIX_PATH")
-        start = self.urdf.resolve().parent
+        above = self.urdf.resolve().parents
         candidates = [
             *(root for root in ros if root.name == name),
             *(root / name for root in ros),
             *(prefix / "share" / name for prefix in ament),
-            *(folder for folder in (start, *start.parents) if folder.name == name),
-            *(folder / name for folder in (start, *start.parents)),
+            *(folder for folder in above if folder.name == name),
+            *(folder / name for folder in above),
         ]
         return next((folder for folder in candidates if folder.is_dir()), None)
 
@@ -56,20 +56,20 @@ class Packages(NamedTuple):
 
         Raises InputError if there is no such file.
         """
-        start = self.urdf.resolve().parent
+        above = self.urdf.resolve().parents
         if filename.startswith("package://"):
             package, _, rest = filename.removeprefix("package://").partition("/")
             folder = self.folder(package)
             places = [] if folder is None else [folder]
-            places += (up / below for up in (start, *start.parents) for below in (package, ""))
-            where = f"the package is {folder}" if folder else f"searched from {start} upwards"
+            places += (up / below for up in above for below in (package, ""))
+            where = f"the package is {folder}" if folder else f"searched from {above[0]} upwards"
             advice = (
                 f" ({where}); give the package's folder: ROS_PACKAGE_PATH, or robot add --package "
                 f"{package}=FOLDER"
             )
         else:
             rest = filename.removeprefix("file://")
-            places = [start]
+            places = [above[0]]
             advice = "; add it, or remove its element"
         for place in places:
             for name in (rest, unquote(rest)):
@@ -104,7 +104,9 @@ def with_prefixes(text: bytes) -> bytes:
 
 
 def compiled_xacro(path: Path, packages: Packages) -> bytes:
-    """The URDF that xacrodoc compiles from a xacro file. This runs the code in its expressions.
+    """The URDF that xacrodoc compiles from a xacro file. This runs the code in its expressions. After an
+    error for an unknown package, the package's folder is added to xacrodoc's look-up, and the file compiled
+    again.
 
     Raises InputError if the file cannot be compiled, or if xacrodoc is not installed.
     """
@@ -117,36 +119,30 @@ def compiled_xacro(path: Path, packages: Packages) -> bytes:
             f"compile it elsewhere: xacro {path.name} > {path.name.split('.')[0]}.urdf"
         ) from None
     with XACRO:
-        return _by_xacro(xacro, known, path, packages)
-
-
-def _by_xacro(xacro: Any, known: Any, path: Path, packages: Packages) -> bytes:
-    """Compiles the file. After an error for an unknown package, adds its folder to `known`, xacrodoc's
-    package look-up, and compiles again."""
-    known.reset()
-    known.walk_up_from(path)
-    known.update_package_cache(packages.folders)
-    for _ in range(MAX_PACKAGES):
-        try:
-            xacro.init_stacks(str(path.resolve()))  # includes are relative to this file
-            document = xacro.parse(None, str(path.resolve()))
-            xacro.process_doc(document, mappings={})
-            return document.toxml("utf-8")  # type: ignore[attr-defined]
-        except Exception as error:  # xacro passes on and wraps exceptions of any kind
-            why = " ".join(str(error).split())
-            missing = PACKAGE_NOT_FOUND.search(why)
-            if missing is None:
-                text = f"{path}: xacro cannot compile it ({why})"
-                if "Undefined substitution argument" in why:
-                    urdf = f"{path.name.split('.')[0]}.urdf"
-                    text += f"; compile it with its arguments: xacro {path.name} NAME:=VALUE > {urdf}"
-                raise InputError(text) from None
-            name = missing[1]
-            folder = packages.folder(name)
-            if folder is None:
-                raise InputError(
-                    f"{path}: package {shown(name)} is not found; give its folder: --package {name}=FOLDER, "
-                    f"or ROS_PACKAGE_PATH"
-                ) from None
-            known.update_package_cache({name: folder})
+        known.reset()
+        known.walk_up_from(path)
+        known.update_package_cache(packages.folders)
+        for _ in range(MAX_PACKAGES):
+            try:
+                xacro.init_stacks(str(path.resolve()))  # includes are relative to this file
+                document = xacro.parse(None, str(path.resolve()))
+                xacro.process_doc(document, mappings={})
+                return document.toxml("utf-8")  # type: ignore[attr-defined]
+            except Exception as error:  # xacro passes on and wraps exceptions of any kind
+                why = " ".join(str(error).split())
+                missing = PACKAGE_NOT_FOUND.search(why)
+                if missing is None:
+                    text = f"{path}: xacro cannot compile it ({why})"
+                    if "Undefined substitution argument" in why:
+                        urdf = f"{path.name.split('.')[0]}.urdf"
+                        text += f"; compile it with its arguments: xacro {path.name} NAME:=VALUE > {urdf}"
+                    raise InputError(text) from None
+                name = missing[1]
+                folder = packages.folder(name)
+                if folder is None:
+                    raise InputError(
+                        f"{path}: package {shown(name)} is not found; give its folder: "
+                        f"--package {name}=FOLDER, or ROS_PACKAGE_PATH"
+                    ) from None
+                known.update_package_cache({name: folder})
     raise InputError(f"{path} refers to {MAX_PACKAGES} packages or more that had to be looked up")

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from robotdiffuse.core.errors import MAX_COORDINATE, InputError, check_name, repeated, shown, unknown_name
 from robotdiffuse.core.files import is_file, parse_xml, read_bytes
-from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, Joint, chain
+from robotdiffuse.robots.kinematic_tree import Joint, chain
 from robotdiffuse.robots.robot import Robot
 
 SRDF_FOLDERS = (".", "../srdf", "../config", "srdf", "config")
@@ -67,7 +67,7 @@ class Srdf:
         no joints connect. Single links without a joint above them are ignored.
         """
         named = self._named(group, {joint.child: joint for joint in joints}, ())
-        return [joint for joint in joints if joint.name in named and joint.kind in MOVING_KINDS]
+        return [joint for joint in joints if joint.name in named and joint.movable]
 
     def tips(self, group: str) -> list[str]:
         """Tip links of the chains that define a group and its subgroups. Raises KeyError for an unknown
@@ -248,12 +248,12 @@ class JointTree:
             self.moving[joint.parent] = max(self.moving.get(joint.parent, 0), self._chain_length(joint))
             below = self._depth.get(joint.child, 0) + 1
             self._depth[joint.parent] = max(self._depth.get(joint.parent, 0), below)
-            if joint.kind in MOVING_KINDS or joint.child in self.roots:
+            if joint.movable or joint.child in self.roots:
                 self.roots.add(joint.parent)
 
     def _chain_length(self, joint: Joint) -> int:
         """Largest number of independent movable joints in a chain that begins with a joint."""
-        return self.moving.get(joint.child, 0) + (joint.kind in MOVING_KINDS and joint.mimic is None)
+        return self.moving.get(joint.child, 0) + (joint.movable and joint.mimic is None)
 
     def arms(self) -> list[Arm]:
         """The chains below the base with at least MIN_ARM_JOINTS own joints; if there are none, the longest
@@ -267,14 +267,13 @@ class JointTree:
         """Arms that continue a chain of joints at a link. The last `own_joints` joints of the chain come
         after the last branching."""
         while True:
-            next_joints = [
-                j for j in self.below.get(link, []) if j.kind in MOVING_KINDS or j.child in self.roots
-            ]
+            next_joints = [j for j in self.below.get(link, []) if j.movable or j.child in self.roots]
             if chain and self._begins_gripper(next_joints, own_joints, chain[-1]):
                 return [Arm(chain, link, own_joints)]
             if len(next_joints) > 1:
-                branches = [self._arms_from(j.child, *self._extended(j, chain, 0)) for j in next_joints]
-                return [arm for branch in branches for arm in branch]
+                return [
+                    arm for j in next_joints for arm in self._arms_from(j.child, *self._extended(j, chain, 0))
+                ]
             if not next_joints:
                 return [Arm(chain, self._deepest(link), own_joints)] if own_joints else []
             chain, own_joints = self._extended(next_joints[0], chain, own_joints)
@@ -282,7 +281,7 @@ class JointTree:
 
     def _extended(self, joint: Joint, chain: tuple[str, ...], own_joints: int) -> tuple[tuple[str, ...], int]:
         """A chain and its number of own joints, extended by a joint if the joint is movable."""
-        return ((*chain, joint.name), own_joints + 1) if joint.kind in MOVING_KINDS else (chain, own_joints)
+        return ((*chain, joint.name), own_joints + 1) if joint.movable else (chain, own_joints)
 
     def _begins_gripper(self, branches: list[Joint], own_joints: int, before: str) -> bool:
         """Whether `branches` begin a gripper or a hand. `before` is the joint before them; `own_joints`
@@ -293,7 +292,7 @@ class JointTree:
             words = [len(GRIPPER.findall(name)) for name in (before, joint.name)]
             finger = lengths == [1] and own_joints >= MIN_ARM_JOINTS and FINGER.search(joint.child)
             jaw = finger or (words[0] < words[1] and lengths[0] <= MAX_HAND_FINGER_JOINTS)
-            return bool(jaw) and joint.kind in MOVING_KINDS
+            return bool(jaw) and joint.movable
         if len(branches) == 2:
             return max(lengths) <= MAX_FINGER_JOINTS
         hand = own_joints >= MIN_ARM_JOINTS and sum(length >= LIMB_JOINTS for length in lengths) not in (1, 2)
@@ -333,7 +332,7 @@ def planned_joints(
     elif group is not None or not tip:
         arms = _chosen_arms(file, JointTree(base, joints).arms(), group, [*srdf.groups])
         tips = tips or [arm.tip for arm in arms] or [base]
-    leading = [joint for end in tips for joint in chain(above, end) if joint.kind in MOVING_KINDS]
+    leading = [joint for end in tips for joint in chain(above, end) if joint.movable]
     not_leading = [name for name in chosen or () if name not in {joint.name for joint in leading}]
     if not_leading:
         raise InputError(

@@ -6,7 +6,7 @@ import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -89,29 +89,26 @@ JERK_PER_ACCELERATION = 10.0
 """Ratio of jerk and acceleration limits [1/s]: full acceleration is reached after 0.1 s."""
 
 
-@dataclass
 class UrdfTree:
     """The links and joints of one URDF file or MuJoCo model, checked as they are read."""
 
-    path: Path
-    folders: dict[str, str | Path]
-    """Folders of ROS packages by name."""
-    compile_xacro: bool = False
-    """Whether a xacro file is compiled, which runs code in it; if False, a xacro file raises InputError."""
-    notes: list[str] = field(default_factory=list)
-    semantics: Srdf | None = None
-    """Named poses and allowed pairs of a MuJoCo model."""
-    unlimited: set[str] = field(default_factory=set)
-    """Joints without a velocity limit."""
-    unranged: set[str] = field(default_factory=set)
-    """Joints without limits of position, such as wheels; they are planned only if `limits` of `robot` gives
-    position limits, and can be held at any value."""
-    text: bytes = field(init=False)
+    text: bytes
     """The URDF, also of a xacro file or a MuJoCo model."""
-    _surfaces: dict[str, tuple[Surface, ...]] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        self.packages = Packages(self.path, self.folders)
+    def __init__(self, path: Path, folders: dict[str, str | Path], compile_xacro: bool = False) -> None:
+        """Read the file. `folders` are folders of ROS packages by name. If `compile_xacro` is true, a xacro
+        file is compiled, which runs code in it; otherwise, a xacro file raises InputError."""
+        self.path = path
+        self.packages = Packages(path, folders)
+        self.notes: list[str] = []
+        self.semantics: Srdf | None = None
+        """Named poses and allowed pairs of a MuJoCo model."""
+        self.unlimited = set[str]()
+        """Joints without a velocity limit."""
+        self.unranged = set[str]()
+        """Joints without limits of position, such as wheels; they are planned only if `limits` of `robot`
+        gives position limits, and can be held at any value."""
+        self._surfaces: dict[str, tuple[Surface, ...]] = {}
 
         def parsed(text: bytes) -> ET.Element:
             self.text = with_prefixes(text)
@@ -124,7 +121,7 @@ class UrdfTree:
             )
         root = parsed(read_bytes(self.path, "URDF"))
         if is_xacro(self.path, root):
-            if not self.compile_xacro:
+            if not compile_xacro:
                 raise InputError(
                     f"{self.path} is a xacro file, and compiling it would run code in it; if you trust it, "
                     f"prepare it first: robotdiffuse robot add {self.path} --name NAME, and use that name"
@@ -265,7 +262,7 @@ class UrdfTree:
             poses=dict(srdf.poses),
         )
         robot = with_limits(robot, limits)
-        movable = [joint for joint in robot.joints if joint.kind in MOVING_KINDS]
+        movable = [joint for joint in robot.joints if joint.movable]
         fixed_joints = [joint.name for joint in movable if joint.lower == joint.upper]
         # a mimic joint has its offset if the joint that it mimics is above the base
         resting = {joint.name: joint.mimic.offset for joint in movable if joint.mimic} | srdf.resting()
@@ -504,15 +501,16 @@ class UrdfTree:
         with a note."""
         inertias = {}
         for link in links:
-            element = self.links[link].find("inertial")
-            mass = None if element is None else element.find("mass")
-            massless = mass is not None and re.fullmatch(r"0+\.?0*", mass.get("value", "").strip())
-            if element is None or mass is None or massless:
+            element = self.links[link].find("inertial[mass]")
+            if element is None:
+                continue
+            mass = _attributes(element, "mass").get("value", "")
+            if re.fullmatch(r"0+\.?0*", mass.strip()):
                 continue
             attributes = _attributes(element, "inertia")
             try:
                 T = self._origin(element, link)
-                texts = (mass.get("value", ""), *(attributes.get(name, "") for name in MOMENTS))
+                texts = (mass, *(attributes.get(name, "") for name in MOMENTS))
                 value, *entries = (self._numbers(text, 1, link)[0] for text in texts)
                 own = inertia_of([value, *T[:3, 3], *entries])
                 inertias[link] = own._replace(moments=T[:3, :3] @ own.moments @ T[:3, :3].T)
@@ -647,9 +645,9 @@ class UrdfTree:
             return transform(xyz, rotation_from_rpy(*map(float, rpy)))
         if "rpy" in origin:
             raise InputError(f"{self.path}: {what}: origin has rpy and quat_xyzw; it must have one of them")
-        numbers = self._numbers(quaternion, 4, f"{what}: origin quat_xyzw")
-        x, y, z, w = unit_quaternion(f"{self.path}: {what}", numbers, "origin quat_xyzw")
-        return transform(xyz, rotation_from_quaternion(np.array([w, x, y, z])))
+        xyzw = self._numbers(quaternion, 4, f"{what}: origin quat_xyzw")
+        wxyz = np.roll(unit_quaternion(f"{self.path}: {what}", xyzw, "origin quat_xyzw"), 1)
+        return transform(xyz, rotation_from_quaternion(wxyz))
 
 
 def _is_endless(limit: str) -> bool:
@@ -716,7 +714,7 @@ def with_limits(robot: Robot, limits: Mapping[str, dict[str, float]]) -> Robot:
     default ratios, unless these limits are given too. A continuous joint with a position limit becomes
     revolute; if only one of its limits is given, the other one is half a turn from zero.
     """
-    movable = [joint.name for joint in robot.joints if joint.kind in MOVING_KINDS]
+    movable = [joint.name for joint in robot.joints if joint.movable]
     for name in limits:
         check_name("joint in joint_limits", name, movable)
     return replace(robot, joints=tuple(_changed(joint, limits.get(joint.name, {})) for joint in robot.joints))

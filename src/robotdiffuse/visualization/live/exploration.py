@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ import viser
 
 from robotdiffuse.core.errors import InputError, described
 from robotdiffuse.core.transforms import quaternion_from_rotation
-from robotdiffuse.core.types import Configuration
+from robotdiffuse.core.types import Configuration, frozen_dataclass
 from robotdiffuse.drawables import ASSUMED, GOAL, OBSERVED, drawables
 from robotdiffuse.perception.depth_view import DepthNoise
 from robotdiffuse.planning.exploration.simulated import (
@@ -97,7 +97,7 @@ PROMISES = {
 """Where each policy lets the arm move, in words for the page."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class ExplorationState:
     """Everything that the page shows at one moment."""
 
@@ -266,8 +266,7 @@ class ExplorationPage(LivePage):
         self._look = Arm(server, "look", self._drawn, LOOK_COLOR, GHOST_OPACITY)
         self._ghost = Arm(server, "goal", self._drawn, GOAL, GHOST_OPACITY)
         self._goal = problem.goal.positions[0] if isinstance(problem.goal, JointGoal) else None
-        ends = np.stack([problem.start, problem.start if self._goal is None else self._goal])
-        server.set_first_view(self._drawn, problem, ends)
+        server.set_first_view(self._drawn, problem, self._goal)
         self._obstacles = Obstacles(server)
         self._add_panel()
         self._begin()
@@ -359,7 +358,7 @@ class ExplorationPage(LivePage):
             scale=CAMERA_SIZE,
             thickness=0.004,
             color=CAMERA_COLOR,
-            wxyz=quaternion_from_rotation(T[:3, :3]),
+            wxyz=quaternion_from_rotation(T),
             position=T[:3, 3],
         )
 

@@ -169,11 +169,11 @@ class Page(LivePage):
                 self._arms["goal"].show(state.goal_configuration)
             self.goal_gizmo.show(state.goal_pose)
             if new("motion", problem.start if state.motion is None else state.motion):
-                self._new_motion(state)
+                self._new_motion(motion, problem.start)
             if new("validation", state.validation):
                 contact = None
                 if violation is not None and motion is not None and violation.kind in COLLISIONS:
-                    contact = interpolated(np.array([violation.time]), motion.times, motion.positions)[0]
+                    contact = interpolated(violation.time, motion.times, motion.positions)
                 self._arms["contact"].show(contact)
             answer = state.answer
             tree_answer = answer if state.options.trees else None
@@ -196,15 +196,12 @@ class Page(LivePage):
         }
         for gizmo in self._gizmos:
             gizmo.handle.scale = gizmo.size * robot.reach
-        problem = self.session.state.problem
-        goal = self.session.state.goal_configuration
-        ends = np.stack([problem.start, problem.start if goal is None else goal])
-        self.server.set_first_view(self._drawn, problem, ends)
+        state = self.session.state
+        self.server.set_first_view(self._drawn, state.problem, state.goal_configuration)
         draw_trees(self.server, self._drawn, ())
         self._changes.forget("start", "goal", "motion", "validation", "scene", "trees")
 
-    def _new_motion(self, state: State) -> None:
-        motion = None if state.motion is None else state.motion.trajectory
+    def _new_motion(self, motion: Trajectory | None, start: Configuration) -> None:
         frames = None
         if motion is not None:
             at = np.append(np.arange(0.0, motion.duration, 1 / POSE_RATE), motion.duration)
@@ -213,7 +210,7 @@ class Page(LivePage):
             self._frames = frames
         draw_trace(self.server, self._drawn, motion)
         if motion is None:
-            self._arms["arm"].show(state.problem.start)
+            self._arms["arm"].show(start)
         else:
             self.player.load(motion.duration)
 
@@ -351,8 +348,7 @@ class Panel:
 
     def _obstacles_tab(self) -> None:
         gui = self._server.gui
-        names: tuple[str, ...] = (NO_OBSTACLE,)
-        self._selected: Any = gui.add_dropdown("Obstacle", names, initial_value=NO_OBSTACLE)
+        self._selected: Any = gui.add_dropdown("Obstacle", (NO_OBSTACLE,), initial_value=NO_OBSTACLE)
         self._sizes_box = gui.add_folder("Size [m]", visible=False)
         self._sizes: dict[str, Any] = {}
         self._delete = gui.add_button("Delete", icon=viser.Icon.TRASH, visible=False)
@@ -397,7 +393,7 @@ class Panel:
 
     def show(self, state: State, validity: Validity, selected: str) -> None:
         """Update the widgets to a state."""
-        if self._changes.new("validity", (validity.kind, validity.headline, validity.lines), state.planning):
+        if self._changes.new("validity", validity, state.planning):
             self._badge.content = badge_html(validity, state.planning)
         if self._changes.new("seconds", state.seconds):
             self._stages.content = _stages_html(state.seconds)
@@ -414,7 +410,7 @@ class Panel:
 
     def _show_obstacle(self, state: State, selected: str) -> None:
         shapes = state.obstacles
-        options: tuple[str, ...] = (NO_OBSTACLE, *shapes)
+        options = (NO_OBSTACLE, *shapes)
         if self._changes.new("options", options):
             self._selected.options = options
         name = selected if selected in shapes else NO_OBSTACLE
@@ -484,19 +480,17 @@ class Panel:
     def _show_plot(self, state: State) -> None:
         robot = state.problem.robot
         motion = state.motion
-        if motion is None or motion.trajectory is None:
-            if self._plot is not None:
-                self._plot.remove()
-                self._plot = None
-            return
-        data = plotted(robot, motion.trajectory, self._kind.value)
         names = robot.joint_names
         other_joints = self._changes.new("joints of the plot", names)
-        if self._plot is not None and not other_joints:
+        if self._plot is not None and (motion is None or other_joints):
+            self._plot.remove()
+            self._plot = None
+        if motion is None:
+            return
+        data = plotted(robot, motion.trajectory, self._kind.value)
+        if self._plot is not None:
             self._plot.data = data
             return
-        if self._plot is not None:
-            self._plot.remove()
         joints = [
             uplot.Series(label=name, stroke=JOINT_COLORS[i % len(JOINT_COLORS)], width=1.5)
             for i, name in enumerate(names)
@@ -523,7 +517,7 @@ def plotted(robot: Robot, motion: Trajectory, kind: str) -> tuple[np.ndarray, ..
     elif kind == "acceleration":
         values = motion.accelerations / robot.acceleration
     else:
-        middle = np.where(robot.continuous, 0.0, 0.5 * (robot.lower + robot.upper))
+        middle = np.where(robot.continuous, 0.0, robot.middle)
         half = np.where(robot.continuous, np.pi, 0.5 * (robot.upper - robot.lower))
         values = (motion.positions - middle) / half
     limit = np.full(len(motion.times), 100.0)
@@ -640,7 +634,7 @@ class Arm:
 def place(node: Any, T: Pose) -> None:
     """Move a node of the 3D scene to a pose. If it is there already, viser sends no message to browsers."""
     node.position = T[:3, 3]
-    node.wxyz = quaternion_from_rotation(T[:3, :3])
+    node.wxyz = quaternion_from_rotation(T)
 
 
 class Obstacles:

@@ -16,7 +16,7 @@ import viser
 from viser import infra
 
 from robotdiffuse.core.network import is_loopback, listening, named_host, url_part
-from robotdiffuse.core.types import Configurations
+from robotdiffuse.core.types import Configuration
 from robotdiffuse.drawables import drawables
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.visualization.picture import VERTICAL_FIELD, DrawnArm, view_of_motion
@@ -121,9 +121,10 @@ class PageServer(viser.ViserServer):
             section_color=(214, 218, 224),
         )
 
-    def set_first_view(self, arm: DrawnArm, problem: Problem, q: Configurations) -> None:
-        """Set the view of new browsers so that the arm is visible beside the panel, at all configurations q
-        [n, dof]."""
+    def set_first_view(self, arm: DrawnArm, problem: Problem, goal: Configuration | None) -> None:
+        """Set the view of new browsers so that the arm is visible beside the panel, at the problem's start
+        and at the configuration `goal`, if there is one."""
+        q = np.stack([problem.start, problem.start if goal is None else goal])
         view = view_of_motion(arm, drawables(problem.scene), q, VIEW_SIZE, VIEW_MARGINS)
         height = 2 * np.tan(VERTICAL_FIELD / 2) * np.linalg.norm(view.target - view.eye)
         aside = PANEL_OFFSET * height * view.rotation[0]

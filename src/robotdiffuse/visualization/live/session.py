@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from importlib.resources import as_file, files
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from robotdiffuse.core.errors import InputError, check_name, described, unknown_
 from robotdiffuse.core.files import decoded, parse_json, parse_yaml
 from robotdiffuse.core.settings import Bound, OneOf, Settings
 from robotdiffuse.core.transforms import inverse, transform
-from robotdiffuse.core.types import Configuration, PlanResult, Pose, Vector
+from robotdiffuse.core.types import Configuration, PlanResult, Pose, Vector, frozen_dataclass
 from robotdiffuse.drawables import own_frame
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner
 from robotdiffuse.planning.planner import Planner
@@ -99,7 +99,7 @@ class Validation:
     """Time that validation took [s]."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass
 class State:
     """Everything that the page shows at one moment."""
 
@@ -367,12 +367,8 @@ def _posed(goal: Goal, frame: str, T_base_frame: Pose) -> PoseGoal | PosesGoal:
     if isinstance(goal, PoseGoal):
         return replace(goal, T_base_frame=T_base_frame)
     if isinstance(goal, PosesGoal):
-        moved = replace(
-            next(link_pose_goal for link_pose_goal in goal.poses if link_pose_goal.frame == frame),
-            T_base_frame=T_base_frame,
-        )
         return PosesGoal(
-            [moved if link_pose_goal.frame == frame else link_pose_goal for link_pose_goal in goal.poses]
+            [replace(pose, T_base_frame=T_base_frame) if pose.frame == frame else pose for pose in goal.poses]
         )
     return PoseGoal(frame, T_base_frame)
 
@@ -412,8 +408,7 @@ def resized(shape: Shape, dimension: str, value: float) -> Shape:
     return replace(shape, **{dimension: value})  # type: ignore[type-var]
 
 
-@dataclass(frozen=True)
-class Validity:
+class Validity(NamedTuple):
     """Kind and text of the badge."""
 
     kind: str

@@ -12,6 +12,7 @@ import trimesh
 import yaml
 
 import robotdiffuse as rd
+from helpers.commands import written as write_record
 from helpers.made_arms import joint, link, read_urdf, written
 from helpers.panda import PANDA
 from helpers.refusals import refuses
@@ -90,12 +91,8 @@ def test_unusable_folders(tmp_path: Path) -> None:
 
 
 def test_vectors_as_mappings_types_as_numbers_and_poses_of_the_object_alone() -> None:
-    data = scene_data(
-        id=3,
-        primitives=[{"type": 3, "dimensions": [0.4, 0.1]}],
-        primitive_poses=[{"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}],
-    )
-    [shape] = shapes_of(data)
+    at = {"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+    [shape] = shapes_of(scene_data(id=3, primitives=[{"type": 3, "dimensions": [0.4, 0.1]}], primitive_poses=[at]))
     assert isinstance(shape, rd.Cylinder) and shape.center.tolist() == [1, 2, 3]
     assert (shape.name, shape.height, shape.radius) == ("3", 0.4, 0.1)
     entry = ball(pose={"position": [0, 0, 2], "orientation": [0, 0, 0, 1]})
@@ -107,15 +104,9 @@ def test_meshes(tmp_path: Path) -> None:
     trimesh.creation.box([1, 1, 1]).export(tmp_path / "cube.stl")
     at = {"position": [0, 0, 1], "orientation": QUARTER}
     rows = [{"x": 0, "y": 0, "z": 0}, {"x": 1, "y": 0, "z": 0}, {"x": 0, "y": 1, "z": 0}]
-    data = scene_data(
-        id="things",
-        meshes=[
-            {"triangles": [{"vertex_indices": [0, 1, 2]}], "vertices": rows},
-            {"resource": "cube.stl", "dimensions": [2, 1, 1]},
-        ],
-        mesh_poses=[at, at],
-    )
-    triangle, cube = shapes_of(data, folder=tmp_path)
+    flat = {"triangles": [{"vertex_indices": [0, 1, 2]}], "vertices": rows}
+    meshes = [flat, {"resource": "cube.stl", "dimensions": [2, 1, 1]}]
+    triangle, cube = shapes_of(scene_data(id="things", meshes=meshes, mesh_poses=[at, at]), folder=tmp_path)
     assert isinstance(triangle, rd.Mesh) and isinstance(cube, rd.Mesh)
     np.testing.assert_allclose(triangle.world_vertices, [[0, 0, 1], [0, 1, 1], [-1, 0, 1]], atol=1e-12)
     np.testing.assert_allclose(cube.bounds, [[-0.5, -1, 0.5], [0.5, 1, 1.5]], atol=1e-12)
@@ -144,21 +135,17 @@ def test_cones_planes_and_octomaps() -> None:
     np.testing.assert_allclose(cloud.points, [np.array([0, 0, 1]) - 0.1 * (2**15 - 0.5)])
 
 
+ZERO = {"position": [0, 0, 0], "orientation": [0, 0, 0, 0]}
+ELSEWHERE = {"meshes": [{"resource": "package://a/b.stl"}], "mesh_poses": ball()["primitive_poses"]}
 WRONG_SCENES: dict[str, tuple[object, str]] = {
     "prism": (scene_data(**ball(primitives=[CONE | {"type": 5}])), "unknown type of .*'prism'; known"),
     "poses": (scene_data(**ball(primitive_poses=[])), "has 1 primitives and 0 primitive_poses"),
-    "quaternion": (
-        scene_data(**ball(primitive_poses=[{"position": [0, 0, 0], "orientation": [0, 0, 0, 0]}])),
-        r"ball: primitive_poses\[0\].orientation .* must not be zero",
-    ),
+    "quaternion": (scene_data(**ball(primitive_poses=[ZERO])), r"ball: primitive_poses\[0\].orientation .* must not be zero"),
     "frame": (scene_data(**ball(header={"frame_id": "moon"})), "header: 'moon'; known: panda_link0, world"),
     "removed": (scene_data(**ball(operation=1)), r"operation is 1; only objects that are added \(0\) or appended \(2\) can be"),
     "plane": (scene_data(**ball(planes=[{"coef": [0, 0, 0, 1]}])), "must not all be zero"),
     "planes": (scene_data(**ball(planes=[{"coef": [0, 0, 1, 1]}] * 2000)), "2,000 planes; at most 1,000"),
-    "package": (
-        scene_data(**ball(meshes=[{"resource": "package://a/b.stl"}], mesh_poses=ball()["primitive_poses"])),
-        r"object ball: meshes\[0\].resource is package://a/b.stl",
-    ),
+    "package": (scene_data(**ball(**ELSEWHERE)), r"object ball: meshes\[0\].resource is package://a/b.stl"),
     "objects": ({"world": {"collision_objects": {}, "octomap": {"octomap": {"data": [1]}}}}, "not binary"),
     "octomap": (octomap([3, 0]), "world.octomap: the tree ends too soon"),
     "octomap of no bytes": (octomap([300, 0]), r"octomap.data is \[300, 0\]; it must be 2 finite numbers within ±255"),
@@ -172,8 +159,7 @@ WRONG_SCENES: dict[str, tuple[object, str]] = {
 
 @pytest.mark.parametrize(("data", "message"), WRONG_SCENES.values(), ids=WRONG_SCENES)
 def test_wrong_scenes(data: object, message: str, tmp_path: Path) -> None:
-    file = tmp_path / "scene.yaml"
-    file.write_text(yaml.safe_dump(data))
+    file = write_record(tmp_path, data, "scene.yaml")
     refuses(f"^{re.escape(str(file))}.*{message}", moveit.read_moveit_scene, file, PANDA)
 
 
@@ -213,8 +199,7 @@ def test_a_scene_and_a_problem_file_allow_contacts(tmp_path: Path) -> None:
     scene, _ = moveit.read_moveit_scene(file, PANDA)
     assert scene.allowed_contacts == ((names[0], ("panda_hand",)),)
     problem = {"robot": "panda", "scene": "scene0001.yaml", "request": "request0001.yaml"}
-    (tmp_path / "problem.yaml").write_text(yaml.safe_dump(problem | {"allowed_contacts": {names[1]: "all"}}))
-    loaded = rd.load_problem(tmp_path / "problem.yaml")
+    loaded = rd.load_problem(write_record(tmp_path, problem | {"allowed_contacts": {names[1]: "all"}}))
     assert loaded.scene.allowed_contacts == ((names[0], ("panda_hand",)), (names[1], "all"))
 
 
@@ -339,16 +324,10 @@ def test_objects_are_held_at_the_start(frame: str, tmp_path: Path) -> None:
     T_hand_rod = transform(np.array([0.0, 0.0, 0.2]))
     T = bare.robot.fk(bare.start, "panda_hand") @ T_hand_rod if frame == "world" else T_hand_rod
     x, y, z, w = np.roll(quaternion_from_rotation(T[:3, :3]), -1).tolist()
-    held = {
-        "link_name": "panda_hand",
-        "touch_links": ["panda_link6", "no_link_of_it"],
-        "object": {
-            "header": {"frame_id": frame},
-            "id": "rod",
-            "primitives": [{"type": "cylinder", "dimensions": [0.2, 0.01]}],
-            "primitive_poses": [{"position": T[:3, 3].tolist(), "orientation": [x, y, z, w]}],
-        },
-    }
+    cylinder = [{"type": "cylinder", "dimensions": [0.2, 0.01]}]
+    at = [{"position": T[:3, 3].tolist(), "orientation": [x, y, z, w]}]
+    shape = ball(id="rod", header={"frame_id": frame}, primitives=cylinder, primitive_poses=at)
+    held = {"link_name": "panda_hand", "touch_links": ["panda_link6", "no_link_of_it"], "object": shape}
     problem = asked(tmp_path, change(request_data(), ["start_state", "attached_collision_objects"], [held])).load()
     [rod] = problem.robot.attached
     assert rod.name == "rod" and rod.touch_links == ("panda_link6",)
@@ -356,7 +335,7 @@ def test_objects_are_held_at_the_start(frame: str, tmp_path: Path) -> None:
     T_world = problem_record(problem)["attached"][0]["cylinder"]  # type: ignore[index]
     np.testing.assert_allclose(T_world["center"], [0, 0, 0.2], atol=1e-9)
     for several in ("primitives", "primitive_poses"):  # Regression: of two shapes, files held only the first
-        held["object"][several] *= 2  # type: ignore[index]
+        shape[several] *= 2
     problem = asked(tmp_path, change(request_data(), ["start_state", "attached_collision_objects"], [held])).load()
     refuses("rod has the shapes .*; a problem file holds only shapes of scenes, and exactly one", problem_record, problem)
 
