@@ -277,12 +277,8 @@ def compile_scene(
         else:
             points.append(shape)
     rows = _rows(solids, reach)
-    return SceneArrays(
-        rows,
-        _boxes_around(rows),
-        *_grid_around(tuple(points), reach, radius),
-        allowed_contacts(scene, groups, solids),
-    )
+    grid = _grid_around(tuple(points), reach, radius)
+    return SceneArrays(rows, _boxes_around(rows), *grid, may_touch=allowed_contacts(scene, groups, solids))
 
 
 def _rows(solids: Sequence[Solid], reach: float) -> ndarray:

@@ -265,12 +265,14 @@ def _checks(robot: Robot) -> Checks:
         part_ranges.append(
             (parts[farther].start, parts[farther].stop, partner_parts.start, partner_parts.stop)
         )
-    kinds, indices, *frames = np.array(rows, np.int64).reshape(-1, 5).T.copy()
+    kinds, indices, near, common, second = np.array(rows, np.int64).reshape(-1, 5).T.copy()
     return Checks(
         kinds,
         indices,
         np.array(part_ranges, np.int64).reshape(-1, 4),
-        *frames,
+        near,
+        common,
+        second,
         check_radii,
         np.array([SURFACES_BELOW if frozenset(check) in robot.grazing else 0.0 for check in checks]),
     )

@@ -205,8 +205,8 @@ def compile_tracks(moving: Sequence[MovingObstacle]) -> Tracks:
         quaternions = np.stack([quaternion_from_rotation(T) for T in poses])
         for i in range(1, len(quaternions)):
             quaternions[i] *= 1.0 if quaternions[i] @ quaternions[i - 1] >= 0 else -1.0
-        speeds = np.append(track_speeds(at, poses, obstacle.radius), 0.0)
-        tracks.append((at, poses[:, :3, 3], quaternions, speeds))
+        track_ends = np.append(track_speeds(at, poses, obstacle.radius), 0.0)
+        tracks.append((at, poses[:, :3, 3], quaternions, track_ends))
         solids += solids_of(Scene([obstacle.shape]))
     boxes = [
         inverse(obstacle.shape.T_base_shape) @ solid.T_base_box
@@ -215,9 +215,13 @@ def compile_tracks(moving: Sequence[MovingObstacle]) -> Tracks:
     # The bounding box of a mesh is aligned with the base frame, so it is rotated in the obstacle's frame;
     # these are the half edges of a larger box, aligned with the obstacle's frame, that contains it.
     half_edges = [np.abs(T[:3, :3]) @ solid.half for T, solid in zip(boxes, solids, strict=True)]
+    times, xyz, wxyz, speeds = map(np.concatenate, zip(*tracks, strict=True))
     return Tracks(
-        np.cumsum([len(times) for times, *_ in tracks]),
-        *map(np.concatenate, zip(*tracks, strict=True)),
+        np.cumsum([len(track[0]) for track in tracks]),
+        times,
+        xyz,
+        wxyz,
+        speeds,
         np.array([obstacle.max_speed or 0.0 for obstacle in moving]),
         np.array([T[:3, 3] for T in boxes]).reshape(-1, 3),
         np.array(half_edges).reshape(-1, 3),

@@ -339,7 +339,7 @@ class KinematicTree(Value):
         return None if (self.parents == np.arange(self.dof)).all() else self.parents.copy()
 
     @property
-    def kernel_joints(self) -> tuple[Any, ...]:
+    def kernel_joints(self) -> tuple[ndarray, ndarray | None, ndarray]:
         """`frame_offsets`, `kernel_parents` and `prismatic` for compiled code, as writable arrays."""
         return for_kernels(self.frame_offsets), self.kernel_parents, np.array(self.prismatic, np.bool_)
 

@@ -17,7 +17,7 @@ from functools import partial
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 from xml.etree import ElementTree as Xml
 
 import numpy as np
@@ -68,6 +68,9 @@ class _Simulation:
 
     def __getattr__(self, name: str) -> Any:
         return partial(getattr(pybullet, name), physicsClientId=self._client)
+
+
+W = TypeVar("W", bound="World")
 
 
 class World:
@@ -132,7 +135,7 @@ class World:
         """PyBullet's collision shape of each mesh, by its vertices and faces. Shapes are reused, because
         PyBullet never frees the memory of a mesh."""
 
-    def __enter__(self) -> "World":
+    def __enter__(self: W) -> W:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -413,9 +413,9 @@ class Verifier:
         candidates += [self._waypoints(q, clock, at_rest), self._goal(q[-1], float(clock[-1]))]
         earliest = [v for v in candidates if v is not None]
         violation = min(earliest, key=lambda v: v.time, default=None)
-        found = tuple(dict.fromkeys((*found, *earliest)))
+        every_violation = tuple(dict.fromkeys((*found, *earliest)))
         clearances = (scene, sweep.self_clearance) if violation is None else (None, None)
-        return Report(violation is None, violation, *clearances, found=found)
+        return Report(violation is None, violation, *clearances, found=every_violation)
 
     def _start(self, q: ndarray) -> Violation | None:
         difference = np.abs(q[0] - self.problem.start)

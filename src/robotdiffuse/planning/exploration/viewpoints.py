@@ -425,16 +425,17 @@ def best_viewpoints(
     start, (width, height) = tree.configurations[0], camera.size
     seen_at_start = 0.0
     if fixed_view is not None:
-        image = fixed_view.intrinsics, fixed_view.depth.shape, np.inf
-        [seen_at_start] = seen_share(robot, start[None], fixed_view.T_base_camera[None], *image, *space)
+        K, size = fixed_view.intrinsics, fixed_view.depth.shape
+        T = fixed_view.T_base_camera[None]
+        [seen_at_start] = seen_share(robot, start[None], T, K, size, np.inf, *space)
 
     def scored(q: Configurations) -> Values:
         """The scores of configurations; 0 for configurations that see less than MIN_SEEN."""
         poses = camera.poses(robot, q)
         seen = seen_share(robot, q, poses, camera.intrinsics, (height, width), camera.range, *space)
         if fixed_view is not None:
-            poses = np.tile(fixed_view.T_base_camera, (len(q), 1, 1))
-            seen_now = seen_share(robot, q, poses, *image, *space)
+            poses = np.repeat(T, len(q), axis=0)
+            seen_now = seen_share(robot, q, poses, K, size, np.inf, *space)
             seen = seen + np.maximum(seen_now - seen_at_start, 0.0)
         score = seen / (1 + np.linalg.norm(q - start, axis=1) / HALVING_DISTANCE)
         for earlier in taken:
