@@ -1,5 +1,5 @@
-"""The checker of proofs. It needs no search, and shares only data types, problem files and transforms with
-the validator.
+"""The checker of proofs. It needs no search, and shares only data types, the motion of single joints,
+problem files and transforms with the validator.
 
 A claim says that a link stays clear of the scene, or of another link. It is proved for stretches of the
 motion, intervals between rows: the clearance in the middle of a stretch exceeds the displacement, which is

@@ -101,7 +101,8 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
         """Approximate minimum duration [s] of a motion through configurations within the limits of velocity
         and acceleration."""
         first = np.gradient(rows, axis=0)
-        second = np.pad(np.diff(rows, 2, axis=0), ((1, 1), (0, 0)), mode="edge")
+        second = np.diff(rows, 2, axis=0)
+        second = np.concatenate([second[:1], second, second[-1:]])
         bounds = symmetric_bounds(limits[1], len(rows))
         grid = np.arange(float(len(rows)))
         return duration_of(grid, fastest_speeds(first, second, grid, limits[0], *bounds))

@@ -121,24 +121,25 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
     return _problem(str(file), data, file.parent, ignore_joints=ignore_joints)
 
 
-def load_problems(file: str | Path) -> list[ProblemEntry]:
+def load_problems(file: str | Path, ignore_joints: bool = False) -> list[ProblemEntry]:
     """All problems of a .jsonl file or a MotionBenchMaker folder, or the one problem of another file.
 
     In a .jsonl file, each line is a problem as in `load_problem`, named after the file and its line number;
-    the first wrong line raises InputError with its number. For folders see `load_motion_bench_maker`.
+    the first wrong line raises InputError with its number. For folders see `load_motion_bench_maker`;
+    `ignore_joints` as in `load_problem`.
     """
     file = file_name(file, "problem file")
     if file.is_dir():
-        return load_motion_bench_maker(file)
+        return load_motion_bench_maker(file, ignore_joints=ignore_joints)
     if file.suffix.lower() != ".jsonl":
-        return [ProblemEntry(file.stem, load_problem(file))]
+        return [ProblemEntry(file.stem, load_problem(file, ignore_joints=ignore_joints))]
     return [
-        ProblemEntry(f"{file.stem}:{number}", _problem_of_line(file, number, line))
+        ProblemEntry(f"{file.stem}:{number}", _problem_of_line(file, number, line, ignore_joints))
         for number, line in _lines(read_text(file))
     ]
 
 
-def _problem_of_line(file: Path, number: int, line: str, ignore_joints: bool = False) -> Problem:
+def _problem_of_line(file: Path, number: int, line: str, ignore_joints: bool) -> Problem:
     location = f"{file}, line {number}"
     return _problem(location, parse_json(line, location), file.parent, ignore_joints=ignore_joints)
 

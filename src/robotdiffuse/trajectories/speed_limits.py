@@ -214,7 +214,8 @@ def jerk_limits(
     else `ratio` times its acceleration limit."""
     if settings.jerk is not None:
         return np.full(robot.dof, settings.jerk)
-    return np.where(robot.jerk > 0, robot.jerk, ratio * robot.acceleration)
+    default = ratio * robot.acceleration if np.isfinite(ratio) else np.full(robot.dof, ratio)
+    return np.where(robot.jerk > 0, robot.jerk, default)
 
 
 def _moving_start(robot: Robot, line: RoundedLine, settings: TimingSettings, start_speed: float) -> Rows:

@@ -109,10 +109,17 @@ def goal_error(
         poses: Cache of the poses T_base_link at q by link, which this function fills.
     """
     poses = {} if poses is None else poses
-    if isinstance(goal, AnyGoal | PosesGoal):
-        chosen, parts = (min, goal.goals) if isinstance(goal, AnyGoal) else (max, goal.poses)
-        errors = (goal_error(robot, part, q, settings, blend, poses) for part in parts)
-        return chosen(errors, key=lambda error: error.excess if error else -1.0)
+    if isinstance(goal, AnyGoal):
+        errors = list[GoalError]()
+        for part in goal.goals:
+            error = goal_error(robot, part, q, settings, blend, poses)
+            if error is None:  # the others need not be computed
+                return None
+            errors.append(error)
+        return min(errors, key=lambda error: error.excess)
+    if isinstance(goal, PosesGoal):
+        parts = (goal_error(robot, part, q, settings, blend, poses) for part in goal.poses)
+        return max(parts, key=lambda error: error.excess if error else -1.0)
     if isinstance(goal, JointGoal):
         differences = goal.positions - q
         differences -= robot.whole_turns(differences)

@@ -145,8 +145,8 @@ def reaches_outside(robot: Robot, q: Configuration) -> bool:
     outside."""
     low, high = _corners_of_map()
     moving = [link for link in robot.spheres if robot.link_frame(link)]
-    centers = np.concatenate([placed(robot.fk(q, link), robot.spheres[link][:, :3]) for link in moving])
-    return bool(((centers < low) | (centers > high)).any())
+    centers = [placed(robot.fk(q, link), robot.spheres[link][:, :3]) for link in moving]
+    return any(((points < low) | (points > high)).any() for points in centers)
 
 
 def _corners_of_map() -> tuple[Vector, Vector]:
@@ -427,7 +427,8 @@ def best_viewpoints(
     if fixed_view is not None:
         K, size = fixed_view.intrinsics, fixed_view.depth.shape
         T = fixed_view.T_base_camera[None]
-        [seen_at_start] = seen_share(robot, start[None], T, K, size, np.inf, *space)
+        reach = fixed_view.range or np.inf
+        [seen_at_start] = seen_share(robot, start[None], T, K, size, reach, *space)
 
     def scored(q: Configurations) -> Values:
         """The scores of configurations; 0 for configurations that see less than MIN_SEEN."""
@@ -435,7 +436,7 @@ def best_viewpoints(
         seen = seen_share(robot, q, poses, camera.intrinsics, (height, width), camera.range, *space)
         if fixed_view is not None:
             poses = np.repeat(T, len(q), axis=0)
-            seen_now = seen_share(robot, q, poses, K, size, np.inf, *space)
+            seen_now = seen_share(robot, q, poses, K, size, reach, *space)
             seen = seen + np.maximum(seen_now - seen_at_start, 0.0)
         score = seen / (1 + np.linalg.norm(q - start, axis=1) / HALVING_DISTANCE)
         for earlier in taken:

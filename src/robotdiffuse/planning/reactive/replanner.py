@@ -671,7 +671,7 @@ class Replanner:
         next_path = self._next or self._path
         clear = self._path_clear(predicted, next_path, self._next is None)
         moving = not self._rests or self._motion.duration > 0
-        leaves = self._must_leave and self._next is None
+        leaves = self._must_leave and self._next is None and not self._is_goal(rest)
         if clear and (next_path.to_goal or moving) and not leaves:
             return clear
         candidate = self._search(predicted, rest, rest_time)

@@ -142,7 +142,7 @@ def compiled_xacro(path: Path, packages: Packages) -> bytes:
                 if folder is None:
                     raise InputError(
                         f"{path}: package {shown(name)} is not found; give its folder: "
-                        f"--package {name}=FOLDER, or ROS_PACKAGE_PATH"
+                        f"ROS_PACKAGE_PATH, or robot add --package {name}=FOLDER"
                     ) from None
                 known.update_package_cache({name: folder})
     raise InputError(f"{path} refers to {MAX_PACKAGES} packages or more that had to be looked up")
