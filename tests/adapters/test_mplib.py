@@ -11,7 +11,7 @@ import trimesh
 
 import robotdiffuse as rd
 from helpers.refusals import refuses
-from robotdiffuse.adapters.mplib import Planner, matrix
+from robotdiffuse.adapters.mplib import Planner, Pose, matrix
 from robotdiffuse.robots.kinematic_tree import Mimic
 
 JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
@@ -279,3 +279,13 @@ def test_self_collisions_are_checked_with_the_other_arm_where_qpos_has_it() -> N
     arm = [-0.8, 0.5, -2.0, 1.5, 2.8, 1.1, 2.9]
     assert not made.check_for_self_collision([*arm, *np.zeros(7)])
     assert made.check_for_self_collision([*arm, 0.3, 1.0, 2.1, 2.0, 2.4, 0.7, -0.9])
+
+
+def test_scripts_of_mplib_02_run_and_held_meshes_are_not_turned(tmp_path: Path) -> None:
+    """Regressions: a whole qpos was refused without user_joint_names, there was no Pose, and a held .glb lay across."""
+    planner = Planner("panda", "panda_hand")
+    status, found = planner.IK(Pose([0.5, 0.2, 0.4], [0, 1, 0, 0]), [0, 0.4, 0, -2, 0, 2.4, 0.8, 0.01, 0.01])
+    assert status == "Success" and len(found[0]) == 9 and planner.robot.locked["panda_finger_joint1"] == 0.01
+    trimesh.creation.box([0.02, 0.04, 0.3]).export(tmp_path / "rod.glb")
+    planner.update_attached_mesh(tmp_path / "rod.glb", [0, 0, 0.2, 1, 0, 0, 0])
+    np.testing.assert_allclose(planner.robot.attached[0].shapes[0].vertices.max(0), [0.01, 0.02, 0.15], atol=1e-6)

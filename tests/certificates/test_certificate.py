@@ -132,3 +132,11 @@ def test_files_that_are_none(tmp_path: FilePath) -> None:
     ):
         file.write_text(text)
         refuses(wanted, rd.load_certificate, file)
+
+
+def test_a_cloud_on_a_base_is_the_one_that_was_certified() -> None:
+    """Regression: the stored cloud was rounded in the world's frame, so that it "has changed"."""
+    robot, points = rd.load_robot("panda"), np.random.default_rng(0).uniform([1.2, -1, 0], [1.8, 1, 1], (3000, 3))
+    base = rd.pose([0.1, 0.2, 0.7], rpy=[0, 0, 0.3])
+    problem = rd.Problem.in_world(base, robot, rd.Scene([rd.PointCloud(points, 0.01)]), "ready", "ready")
+    assert rd.certify(problem, rd.Path(robot.joint_names, problem.start[None])).check().valid

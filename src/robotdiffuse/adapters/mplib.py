@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import lru_cache, partial, reduce
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy import ndarray
@@ -30,6 +30,7 @@ from robotdiffuse.core.errors import (
     shown,
 )
 from robotdiffuse.core.files import file_name, read_bytes
+from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import pose, transform
 from robotdiffuse.core.types import PlanResult
 from robotdiffuse.planning.workspace import Workspace
@@ -39,7 +40,7 @@ from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.bodies import RigidShape
 from robotdiffuse.robots.fitting.preparation import add_robot
 from robotdiffuse.robots.parsing.urdf import UrdfTree, with_limits
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.robots.robot_folder import ROBOT_FILE, user_robots
 from robotdiffuse.scenes.scene import without_link
 from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Sphere
@@ -81,6 +82,13 @@ OPTIONS = (
 here, such as constraints, are refused."""
 
 
+class Pose(NamedTuple):
+    """MPlib 0.2's pose: position and quaternion w, x, y, z."""
+
+    p: ArrayLike = (0.0, 0.0, 0.0)
+    q: ArrayLike = (1.0, 0.0, 0.0, 0.0)
+
+
 class Planner:
     """Plans motions of a robot, as `mplib.Planner` does.
 
@@ -92,7 +100,7 @@ class Planner:
         package_keyword_replacement: The folder that replaces `package://` in the URDF.
         user_link_names: Links that `link_id` counts from 0.
         user_joint_names: Joints in the order of `qpos`, in which planned joints have the order of the chain;
-            none: the planned joints.
+            none: all that move, in the order of the URDF; a `qpos` may also hold the planned ones alone.
         joint_vel_limits: Velocity limits of the planned joints [rad/s]; none: 1, as in MPlib.
         joint_acc_limits: Acceleration limits of the planned joints [rad/s²]; none: those of the robot (MPlib:
             1).
@@ -128,8 +136,9 @@ class Planner:
         check_list("user_joint_names", user_joint_names, str, "names of joints")
         check_list("user_link_names", user_link_names, str, "names of links")
         robot = _robot(urdf, move_group, srdf, package_keyword_replacement or new_package_keyword)
-        self.joint_names = tuple(user_joint_names) or robot.joint_names
         joints = [joint.name for joint in robot.joints]
+        movable = (joint.name for joint in robot.joints if joint.kind in MOVING_KINDS)
+        self.joint_names = tuple(user_joint_names or movable)
         for name in self.joint_names:
             check_name("joint in user_joint_names", name, joints)
         self._places = [i for i, name in enumerate(self.joint_names) if name in robot.joint_names]
@@ -218,7 +227,8 @@ class Planner:
 
     def update_attached_mesh(self, mesh_path: str | Path, pose: Any, *link: Any, **named: Any) -> None:
         """Hold a mesh; see `update_attached_box`."""
-        self._hold(Mesh.from_file(mesh_path, name=HELD).moved(matrix(pose)), *link, **named)
+        mesh = Mesh(*read_triangles(mesh_path, turn=False), name=HELD)  # as in MPlib
+        self._hold(mesh.moved(matrix(pose)), *link, **named)
 
     def detach_object(self, name: str = HELD, also_remove: bool = True) -> bool:
         """Release the held object, without adding it to the obstacles (`also_remove` is ignored). Returns

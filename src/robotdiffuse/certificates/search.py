@@ -258,7 +258,8 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         margins[SCENE] = min(margins[SCENE], *moving_margins.values())
     record = None
     with suppress(InputError):  # the robot may have been made in this program, and have no file
-        record = problem_record(problem)
+        # numbers in the world's frame would be rounded; only a payload's weight depends on the base's pose
+        record = problem_record(problem if problem.payload else replace(problem, T_world_base=None))
     jerks = cubic_jerks(robot, motion)
     return Certificate(
         robot.name,

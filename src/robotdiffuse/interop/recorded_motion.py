@@ -29,6 +29,7 @@ from robotdiffuse.core.types import (
     check_motion_arrays,
     frozen_dataclass,
 )
+from robotdiffuse.problems.moveit import at_state
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.scene import Scene
@@ -185,12 +186,7 @@ def _mean_accelerations(motion: Trajectory) -> JointRows:
 def problem_of_motion(motion: RecordedMotion, robot: Robot, scene: Scene) -> Problem:
     """A problem in the scene, from the first to the last row of the motion. Joints of the recording that are
     not planned are locked at their values in the first row."""
-    movable = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
-    movable -= set(robot.joint_names)
-    locked = {
-        name: float(motion.positions[0, j]) for j, name in enumerate(motion.joint_names) if name in movable
-    }
-    robot = robot.with_locked(locked)
+    robot = at_state(robot, dict(zip(motion.joint_names, motion.positions[0].tolist(), strict=True)))
     q = motion_of_robot(motion, robot).motion.positions
     return Problem(robot, scene, q[0], JointGoal(q[-1:]))
 

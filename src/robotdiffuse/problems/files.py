@@ -10,7 +10,7 @@ store whether each problem is trivial, and the length of its shortest known path
 
 import itertools
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from numbers import Integral
 from pathlib import Path
@@ -48,15 +48,14 @@ from robotdiffuse.problems.fields import (
     rounded,
 )
 from robotdiffuse.problems.moveit import (
-    SCENE,
     MoveItRequest,
-    joint_state,
-    mapping_of,
+    at_state,
     moveit_frames,
     moveit_model,
     moveit_request,
     moveit_scene,
     scene_robot_notes,
+    scene_state,
 )
 from robotdiffuse.problems.problem import Goal, JointGoal, PoseGoal, Problem, moved
 from robotdiffuse.robots import FILE_ENDINGS, ROBOTS, load_robot
@@ -275,21 +274,25 @@ def load_motion_bench_maker(
 
 
 def _requested(
-    robot: Robot, scene: Scene, request: MoveItRequest, notes: list[str], options: dict[str, Any]
+    robot: Robot,
+    scene: Scene,
+    request: MoveItRequest,
+    notes: list[str],
+    stated: Collection[str],
+    options: dict[str, Any],
 ) -> Problem:
-    """The problem of a MoveIt request. Joints that are not planned are locked at its start state."""
+    """The problem of a MoveIt request. Joints that are not planned are locked at its start state, except
+    those that the problem states as `locked` (`stated`)."""
     unplanned = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
-    unplanned -= {*robot.joint_names}
+    unplanned -= {*robot.joint_names, *stated}
     robot = robot.with_locked({name: value for name, value in request.start.items() if name in unplanned})
     notes = [*request.notes, *notes]
     for joint in robot.joints:
         locked = robot.locked.get(joint.name)
-        if joint.mimic is None or locked is None:
-            continue
         start_value = request.start.get(joint.name, locked)
-        if abs(locked - start_value) > MIMIC_SLACK:
-            implied = f"it mimics {joint.mimic.joint}: held at {locked:g}"
-            notes.append(f"start_state: {joint.name} is {start_value:g}, but {implied}")
+        if locked is not None and abs(locked - start_value) > MIMIC_SLACK:
+            why = f"mimics {joint.mimic.joint}:" if joint.mimic else "is"
+            notes.append(f"start_state: {joint.name} is {start_value:g}, but it {why} held at {locked:g}")
 
     for i, values in enumerate(request.joint_goals):
         for name, value in values.items():
@@ -337,6 +340,7 @@ def _problem(
         with located(scene_place):
             content = read_yaml(scene_place) if from_moveit else {}
             notes += scene_robot_notes(content, robot, ignore_joints)
+            robot = at_state(robot, scene_state(content) | values.get("locked", {}))
             frames = moveit_frames(content, robot)
         request = None
         names = robot.link_names
@@ -366,10 +370,9 @@ def _problem(
                 notes += request.robot_notes(robot, moveit_model(content), ignore_joints)
                 # as in MoveIt, joints that the request leaves out start where the scene has them
                 mimics = {joint.name for joint in robot.joints if joint.mimic is not None}
-                current = joint_state(mapping_of(SCENE, content, "robot_state"), "robot_state")
-                current = {name: value for name, value in current.items() if name not in mimics}
+                current = {name: value for name, value in scene_state(content).items() if name not in mimics}
                 request = replace(request, start=current | request.start)
-                return _requested(robot, scene, request, notes, options)
+                return _requested(robot, scene, request, notes, values.get("locked", {}), options)
         if base is None:
             return Problem(robot, scene, notes=tuple(notes), **options)
         return Problem.in_world(base, robot, scene, notes=tuple(notes), **options)

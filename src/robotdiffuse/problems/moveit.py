@@ -5,7 +5,7 @@ Messages: PlanningScene and MotionPlanRequest in https://docs.ros.org/en/noetic/
 Vectors may be lists or mappings (x, y, z), and quaternions are xyzw.
 """
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -55,8 +55,19 @@ OBJECT_FIELDS = (
     *("header", "pose", "id", "type", "primitives", "primitive_poses", "meshes", "mesh_poses", "planes"),
     *("plane_poses", "subframe_names", "subframe_poses", "operation"),
 )
-REMOVALS = (1, 3, "\1", "\3", b"\1", b"\3")
-"""Values of an object's field `operation` that mean to remove or to move it."""
+REQUEST_FIELDS = (
+    *("workspace_parameters", "start_state", "goal_constraints", "path_constraints", "group_name"),
+    *("trajectory_constraints", "reference_trajectories", "pipeline_id", "planner_id"),
+    *("num_planning_attempts", "allowed_planning_time", "max_velocity_scaling_factor"),
+    *("max_acceleration_scaling_factor", "cartesian_speed_end_effector_link"),
+    *("cartesian_speed_limited_link", "max_cartesian_speed"),
+)
+GOAL_FIELDS = (
+    "name",
+    *(f"{kind}_constraints" for kind in ("joint", "position", "orientation", "visibility")),
+)
+ADDITIONS = (None, 0, 2, "\0", "\2", b"\0", b"\2")
+"""Values of an object's field `operation` that mean to add it or to append to it."""
 
 # Edge length and thickness of the box that stands for a plane [m].
 PLANE_EXTENT = 20.0
@@ -211,7 +222,10 @@ def moveit_frames(data: object, robot: Robot) -> MoveItFrames:
     for location, entry in mappings_of("", mapping_of(SCENE, data), "fixed_frame_transforms"):
         child = str(entry.get("child_frame_id", "")).removeprefix("/")
         T = pose_of(f"{location}.transform", entry.get("transform"), "translation", "rotation")
-        if not frames.unknown_reason and child not in frames.links:
+        frame = frame_name(location, entry)
+        if frame and child in frames:  # as MoveIt writes them: the header's frame in the planning frame
+            frames |= {} if frame in frames.links else {frame: frames[child] @ T}
+        elif not frames.unknown_reason and child not in frames.links:
             frames[child] = frames.of_header(location, entry) @ T
     return frames
 
@@ -269,6 +283,14 @@ def matrix_contacts(
     ]
     if any(len(row) != len(names) for row in (rows, *rows)):
         raise InputError(f"{MATRIX} has {len(names)} entry_names; entry_values must be square, of this size")
+    for value in (*default_values, *(value for row in rows for value in row)):
+        if value not in (False, True):
+            raise InputError(f"{MATRIX} has the value {shown(value)}; its values must be true or false")
+    if len(default_values) != len(default_names):
+        raise InputError(
+            f"{MATRIX} has {len(default_names)} default_entry_names; it must have as many "
+            "default_entry_values"
+        )
     pairs = {
         (str(name), str(partner)): bool(value)
         for name, row in zip(names, rows, strict=True)
@@ -312,7 +334,7 @@ def object_shapes(entry: JsonObject, frames: MoveItFrames, folder: Path) -> list
     folder: names of mesh files are relative to it.
     """
     check_fields("the object", entry, (), OBJECT_FIELDS)
-    if entry.get("operation") in REMOVALS:
+    if entry.get("operation") not in ADDITIONS:
         raise InputError(
             f"operation is {shown(entry['operation'])}; only objects that are added (0) or appended (2) can "
             "be read"
@@ -406,6 +428,18 @@ def moveit_model(data: object) -> str:
     return str((data.get("robot_model_name") if isinstance(data, dict) else None) or "")
 
 
+def scene_state(data: object) -> dict[str, float]:
+    """The joint values of a parsed planning scene by name."""
+    return joint_state(mapping_of(SCENE, data, "robot_state"), "robot_state")
+
+
+def at_state(robot: Robot, values: Mapping[str, float]) -> Robot:
+    """The robot with the joints that are not planned, and follow no other joint, locked at these values."""
+    unplanned = {joint.name for joint in robot.joints if joint.movable and joint.mimic is None}
+    unplanned -= {*robot.joint_names}
+    return robot.with_locked({name: value for name, value in values.items() if name in unplanned})
+
+
 def scene_robot_notes(data: object, robot: Robot, ignore_joints: bool = False) -> tuple[str, ...]:
     """Notes on differences between a robot and the robot of a parsed planning scene.
 
@@ -413,7 +447,7 @@ def scene_robot_notes(data: object, robot: Robot, ignore_joints: bool = False) -
     only noted, because the same arm has many names. Names of multi-dof joints are ignored: these are virtual
     joints of an SRDF, and their transforms only give the pose of the robot's root.
     """
-    values = joint_state(mapping_of(SCENE, data, "robot_state"), "robot_state")
+    values = scene_state(data)
     model = moveit_model(data)
     notes = []
     if model not in ("", robot.name):
@@ -516,7 +550,7 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
     other goals, path and trajectory constraints, reference trajectories and max_cartesian_speed, because
     ignoring them would change the problem; and for scaling factors that are not from 0 to 1.
     """
-    data = mapping_of(REQUEST, data)
+    data = check_fields(REQUEST, mapping_of(REQUEST, data), (), REQUEST_FIELDS)
     for name in ("path_constraints", "trajectory_constraints"):
         if any(mapping_of(REQUEST, data, name).values()):
             raise InputError(f"{name} are not supported")
@@ -557,6 +591,8 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
     goals = mappings_of("", data, "goal_constraints")
     if not goals:
         raise InputError("goal_constraints is empty; it must hold at least one goal")
+    for where, goal in goals:
+        check_fields(where, goal, (), GOAL_FIELDS)
     joint_goals = ()
     pose_goal = None
     pose_fields = ("position_constraints", "orientation_constraints")

@@ -506,3 +506,38 @@ def test_what_a_request_leaves_out_or_asks_in_vain(tmp_path: Path) -> None:
     data["start_state"]["attached_collision_objects"] = [{"link_name": "panda_hand", "object": {"id": "cup"}}]
     cup, tolerance = moveit.moveit_request(data, moveit.moveit_frames({}, PANDA)).notes
     assert tolerance.endswith("its tolerance of 1.5 is ignored") and "panda_hand holds, has no shapes" in cup
+
+
+def test_frames_are_read_as_moveit_writes_them() -> None:
+    """Regression: the pose of `world` in the planning frame was dropped, and other frames of TF were refused."""
+    shift = {"translation": [0, 0, 0.8], "rotation": [0, 0, 0, 1]}
+    for frame, child in (("world", "panda_link0"), ("camera", "world")):
+        fixed = {"header": {"frame_id": frame}, "child_frame_id": child, "transform": shift}
+        assert place(at(frame, fixed_frame_transforms=[fixed])) == [0, 0, 0.8]
+
+
+def test_unknown_fields_operations_and_texts_in_a_matrix_are_refused() -> None:
+    """Regressions: a field path_constraint was ignored, an object to REMOVE became an obstacle, "false" allowed contact."""
+    for where in ([], ["goal_constraints", 0]):
+        data = change(request_data(), [*where, "path_constraint"], {})
+        refuses("unknown field of .*'path_constraint'", moveit.moveit_request, data, moveit.moveit_frames(scene_data(), PANDA))
+    refuses("operation is 'REMOVE'", shapes_of, scene_data(**ball(operation="REMOVE")))
+    texts = {"entry_names": ["can"], "entry_values": [["false"]]}
+    for part in (texts, {"default_entry_names": ["can"], "default_entry_values": []}):
+        refuses("default_entry_values|must be true or false", moveit.matrix_contacts, part, ["can"], ["panda_hand"])
+
+
+def test_locked_joints_stay_locked_in_a_request(tmp_path: Path) -> None:
+    """Regression: a joint that the problem locks was held at its value in the request instead."""
+    for name, data in (("s.json", scene_data()), ("r.json", request_data())):
+        write_record(tmp_path, data, name)
+    files = {"robot": "panda", "scene": "s.json", "request": "r.json", "locked": {"panda_joint7": 0.3}}
+    assert rd.load_problem(write_record(tmp_path, files)).robot.locked["panda_joint7"] == 0.3
+
+
+def test_joints_that_are_not_planned_stand_where_the_scene_has_them(tmp_path: Path) -> None:
+    """Regression: without a request, robot_state was ignored: the other arm stood at 0, and motions into it were valid."""
+    write_record(tmp_path, {"robot_state": {"joint_state": {"name": ["right_s0"], "position": [1.5]}}}, "scene.yaml")
+    ends = {"start": [0, -0.5, 0, 1, 0, 1, 0], "goal": {"joints": [0.1, -0.5, 0, 1, 0, 1, 0]}}
+    problem = write_record(tmp_path, {"robot": "baxter_left", "scene": "scene.yaml", **ends})
+    assert rd.load_problem(problem).robot.locked["right_s0"] == 1.5
