@@ -285,7 +285,7 @@ def test_scripts_of_mplib_02_run_and_held_meshes_are_not_turned(tmp_path: Path) 
     """Regressions: a whole qpos was refused without user_joint_names, there was no Pose, and a held .glb lay across."""
     planner = Planner("panda", "panda_hand")
     status, found = planner.IK(Pose([0.5, 0.2, 0.4], [0, 1, 0, 0]), [0, 0.4, 0, -2, 0, 2.4, 0.8, 0.01, 0.01])
-    assert status == "Success" and len(found[0]) == 9 and planner.robot.locked["panda_finger_joint1"] == 0.01
+    assert status == "Success" and found and len(found[0]) == 9 and planner.robot.locked["panda_finger_joint1"] == 0.01
     trimesh.creation.box([0.02, 0.04, 0.3]).export(tmp_path / "rod.glb")
     planner.update_attached_mesh(tmp_path / "rod.glb", [0, 0, 0.2, 1, 0, 0, 0])
-    np.testing.assert_allclose(planner.robot.attached[0].shapes[0].vertices.max(0), [0.01, 0.02, 0.15], atol=1e-6)
+    np.testing.assert_allclose(planner.robot.attached[0].shapes[0].bounds[1] - [0, 0, 0.2], [0.01, 0.02, 0.15], atol=1e-6)

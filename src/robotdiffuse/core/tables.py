@@ -146,16 +146,16 @@ def terminal(table: Table) -> "RichTable":
     return rich_table
 
 
-def show(*tables: Table) -> None:
+def show(*tables: Table, width: int | None = None) -> None:
     """Print tables as wide as the terminal, or as WIDTH without one."""
     # Tables of pairs are printed without rich: importing it takes longer than planning a motion.
     if all(len(table.columns) == 2 and not table.headed for table in tables):
-        columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else WIDTH
+        columns = width or (shutil.get_terminal_size().columns if sys.stdout.isatty() else WIDTH)
         print("\n\n".join("\n".join(pair_lines(table, columns)) for table in tables))
         return
     from rich.console import Console
 
-    console = Console(width=None if sys.stdout.isatty() else WIDTH)
+    console = Console(width=width or (None if sys.stdout.isatty() else WIDTH))
     for i, table in enumerate(tables):
         console.print(*([""] if i else []), terminal(table), sep="\n")
 

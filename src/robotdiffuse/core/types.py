@@ -329,7 +329,8 @@ class Trajectory(Value):
         speed = np.linalg.norm(self.velocities, axis=1)
         resting = speed <= REST * speed.max()
         runs = np.split(np.arange(len(speed)), np.flatnonzero(np.diff(resting)) + 1)
-        slowest = [run[speed[run] == speed[run].min()] for run in runs[1:-1] if resting[run[0]]]
+        rounding = 1e-9 * speed.max()
+        slowest = [run[speed[run] <= speed[run].min() + rounding] for run in runs[1:-1] if resting[run[0]]]
         return np.array([self.times[rows[[0, -1]]].mean() for rows in slowest])
 
     @property
@@ -414,7 +415,7 @@ class Trajectory(Value):
             return self
         cuts = np.array([0.0, *self.stops, self.duration])
         lengths = np.diff(cuts)
-        steps = np.ceil(lengths[:-1] * rate - TIME_TOLERANCE)
+        steps = np.maximum(np.ceil(lengths[:-1] * rate - TIME_TOLERANCE), 1)
         begins = np.append(0.0, np.cumsum(steps)) / rate  # new times of the start and of the stops
         duration = begins[-1] + lengths[-1]
         count = int(np.ceil((duration - TIME_TOLERANCE) * rate))

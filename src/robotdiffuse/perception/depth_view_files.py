@@ -10,6 +10,7 @@ Further fields are configuration, pose_deviation, range and noise. They have the
 
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -247,20 +248,21 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
 
 
 def _is_that_of_file(view: DepthView) -> bool:
-    """Whether a view's image is still that of its file, as `dataclasses.replace` keeps the source."""
+    """Whether a view's image or cloud is still that of its file; `dataclasses.replace` keeps the source."""
     source: Any = view.source
-    try:
+    with suppress(InputError, KeyError):
+        if view.cloud is not None:
+            return np.array_equal(read_points(source["cloud"])[0], view.cloud)
         image = read_depth(source["depth"], source.get("scale"))
-    except InputError:
-        return False
-    return np.array_equal(replace(view, depth=image).depth, view.depth, equal_nan=True)
+        return np.array_equal(replace(view, depth=image).depth, view.depth, equal_nan=True)
+    return False
 
 
 def view_entry(view: DepthView, folder: Path | None) -> JsonObject:
     """The entry of a view, in the form that `read_views` reads. Data that were read from a file are written
     as the file's name, relative to the folder."""
     entry: JsonObject = {}
-    if view.source is not None and (view.cloud is not None or _is_that_of_file(view)):
+    if view.source is not None and _is_that_of_file(view):
         entry |= {
             name: name_from(folder, Path(value)) if isinstance(value, str) else value
             for name, value in view.source.items()

@@ -289,8 +289,10 @@ def _requested(
     notes = [*request.notes, *notes]
     for joint in robot.joints:
         locked = robot.locked.get(joint.name)
+        if locked is None:
+            continue
         start_value = request.start.get(joint.name, locked)
-        if locked is not None and abs(locked - start_value) > MIMIC_SLACK:
+        if abs(locked - start_value) > MIMIC_SLACK:
             why = f"mimics {joint.mimic.joint}:" if joint.mimic else "is"
             notes.append(f"start_state: {joint.name} is {start_value:g}, but it {why} held at {locked:g}")
 

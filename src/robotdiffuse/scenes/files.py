@@ -150,7 +150,7 @@ def _in_file(shape: Shape) -> bool:
     file = getattr(shape, "file", None)
     if file is None:
         return False
-    with suppress(InputError):
+    with suppress(InputError, TypeError):
         arrays = [getattr(shape, name) for name in FILE_CONTENT[shape.kind]]
         stored = _content(type(shape), file, [])
         return all(np.array_equal(*pair, equal_nan=True) for pair in zip(arrays, stored, strict=True))
