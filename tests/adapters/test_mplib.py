@@ -288,4 +288,6 @@ def test_scripts_of_mplib_02_run_and_held_meshes_are_not_turned(tmp_path: Path) 
     assert status == "Success" and found and len(found[0]) == 9 and planner.robot.locked["panda_finger_joint1"] == 0.01
     trimesh.creation.box([0.02, 0.04, 0.3]).export(tmp_path / "rod.glb")
     planner.update_attached_mesh(tmp_path / "rod.glb", [0, 0, 0.2, 1, 0, 0, 0])
-    np.testing.assert_allclose(planner.robot.attached[0].shapes[0].bounds[1] - [0, 0, 0.2], [0.01, 0.02, 0.15], atol=1e-6)
+    [rod] = planner.robot.attached[0].shapes
+    assert isinstance(rod, rd.Mesh)
+    np.testing.assert_allclose(rod.bounds[1] - [0, 0, 0.2], [0.01, 0.02, 0.15], atol=1e-6)

@@ -631,7 +631,7 @@ class MovingProver(Prover):
         links = np.array([self._link_index[claim.link] for claim in self.claims])[stretches.claim]
         numbers = [self.obstacles.names.index(claim.against) for claim in self.claims]
         obstacle_indices = np.array(numbers)[stretches.claim]
-        speed, known, reference_pose = (
+        speed, motion_known, reference_pose = (
             np.array(values)[obstacle_indices]
             for values in zip(
                 *(
@@ -641,7 +641,9 @@ class MovingProver(Prover):
                 strict=True,
             )
         )
-        obstacle_motion = speed * np.where(known, np.maximum(at - begin, end - at), np.maximum(end, 0.0))
+        obstacle_motion = speed * np.where(
+            motion_known, np.maximum(at - begin, end - at), np.maximum(end, 0.0)
+        )
         T = np.array([self.moving[i].pose(time) for i, time in zip(obstacle_indices, at, strict=True)])
 
         def distances(row: ndarray, _: ndarray, centers: ndarray) -> Values:

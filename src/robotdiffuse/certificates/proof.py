@@ -221,5 +221,5 @@ def _numbers(shape: Shape) -> list[object]:
 
 
 def _hash(names: object, *numbers: object) -> str:
-    given = [NOTHING if values is None else values for values in numbers]
-    return hashlib.sha256(hashed_content(names, *given)).hexdigest()[:HASH_LENGTH]
+    arrays = [NOTHING if values is None else values for values in numbers]
+    return hashlib.sha256(hashed_content(names, *arrays)).hexdigest()[:HASH_LENGTH]

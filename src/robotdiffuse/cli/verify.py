@@ -129,7 +129,7 @@ def _read(
     else:
         robot = load_robot(arguments.robot)
         scene, scene_notes = read_moveit_scene(str(arguments.scene), robot, arguments.ignore_joints)
-        robot = at_state(robot, scene_state(read_yaml(arguments.scene)))
+        robot = at_state(robot, scene_state(read_yaml(str(arguments.scene))))
         problem = problem_of_motion(recorded, robot, scene)
     with located(arguments.motion):
         converted = motion_of_robot(recorded, problem.robot)

@@ -585,8 +585,8 @@ class Workspace:
                     furthest = StepsResult(tuple(steps), (*results, result), space, reason, 0.0)
                 planned.pop()
                 if not planned:
-                    tried = f"; {tried_ends} ends of earlier steps were tried" if tried_ends > 1 else ""
-                    reason = furthest.reason + tried
+                    ends_note = f"; {tried_ends} ends of earlier steps were tried" if tried_ends > 1 else ""
+                    reason = furthest.reason + ends_note
                     return replace(furthest, reason=reason, planning_time=clock() - began)
                 tried_ends += isinstance(steps[planned[-1][0]], MoveTo)
                 over = clock() - began > time_limit
@@ -687,8 +687,8 @@ class Workspace:
         """A goal without tolerances: the pose within the tolerances of `goal` that is near to the pose of its
         link at q. Each coordinate of the link's pose is clipped to its tolerance."""
         T = inverse(goal.T_base_frame) @ self.robot.fk(q, goal.frame)
-        given = goal.xyz_tolerance, goal.rpy_tolerance
-        xyz_tolerance, rpy_tolerance = (0.0 if most is None else most for most in given)
+        tolerances = goal.xyz_tolerance, goal.rpy_tolerance
+        xyz_tolerance, rpy_tolerance = (0.0 if size is None else size for size in tolerances)
         xyz = np.clip(T[:3, 3], -xyz_tolerance, xyz_tolerance)
         rpy = np.clip(rpy_from_rotation(T[:3, :3]), -rpy_tolerance, rpy_tolerance)
         return PoseGoal(goal.frame, goal.T_base_frame @ pose_matrix(xyz, rpy=rpy))

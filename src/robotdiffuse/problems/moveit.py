@@ -591,8 +591,8 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
     goals = mappings_of("", data, "goal_constraints")
     if not goals:
         raise InputError("goal_constraints is empty; it must hold at least one goal")
-    for where, goal in goals:
-        check_fields(where, goal, (), GOAL_FIELDS)
+    for goal_name, goal in goals:
+        check_fields(goal_name, goal, (), GOAL_FIELDS)
     joint_goals = ()
     pose_goal = None
     pose_fields = ("position_constraints", "orientation_constraints")

@@ -52,12 +52,12 @@ class PyBulletOracle(World):
         ]
         candidates += [(a, b, self.body, self.links[b]) for a, b in self.pairs]
         best: OracleContact | None = None
-        for link, other, body, index in candidates:
+        for link, partner, body, index in candidates:
             points = self.bullet.getClosestPoints(self.body, body, max(within, 0.0), self.links[link], index)
             distance = min(map(self.gap, points), default=np.inf)
             if distance <= within:
                 within = distance
-                best = OracleContact(link, other, distance)
+                best = OracleContact(link, partner, distance)
         return best
 
     def distance(self, q: Configuration) -> float:

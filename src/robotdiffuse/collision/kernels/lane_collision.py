@@ -237,10 +237,10 @@ def _rows_touch(robot, row, f, other_row, other_f, i, work):
     """Whether a row of spheres of frame f touches the row `other_row` of frame `other_f` in lane i."""
     centers = _place_row(robot, row, work.frames, f, i)
     radius = load(robot.rows, row, 3)
-    others = work.row
-    store_vector(others, 0, 0, _place_row(robot, other_row, work.frames, other_f, i))
+    other_centers = work.row
+    store_vector(other_centers, 0, 0, _place_row(robot, other_row, work.frames, other_f, i))
     for t in range(W):
-        if _touching_balls(centers, radius + robot.rows[other_row, 3 * W + t], others[0, t::W], _ZERO):
+        if _touching_balls(centers, radius + robot.rows[other_row, 3 * W + t], other_centers[0, t::W], _ZERO):
             return True
     return False
 

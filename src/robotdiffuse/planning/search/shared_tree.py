@@ -394,8 +394,8 @@ class SharedTreeSearch:
                 self._graft(path, self.best_goal)
         self.costs.append(self.cost)
         self._rounds_at_distance += 1
-        tried = self._rounds_at_distance >= settings.step_rounds
-        if self.best_goal < 0 and self._later_distances and tried:
+        distance_tried = self._rounds_at_distance >= settings.step_rounds
+        if self.best_goal < 0 and self._later_distances and distance_tried:
             self._lower_distance()
 
     def _lower_distance(self) -> None:
