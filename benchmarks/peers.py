@@ -50,7 +50,7 @@ from common import (
 from robotdiffuse.core.transforms import pose_entry
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.problems.files import ProblemEntry, goal_of, load_motion_bench_maker
-from robotdiffuse.robots.robot import MOVING_KINDS, Robot
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Box, Cylinder
 from robotdiffuse.simulation.world import write_urdf
 
@@ -85,7 +85,7 @@ def robot_files(robot: Robot, folder: Path) -> dict[str, Any]:
     urdf = write_urdf(robot, folder)
     tree = ET.parse(urdf)
     for element, joint in zip(tree.iter("joint"), robot.joints, strict=True):
-        if joint.kind in MOVING_KINDS and joint.name not in robot.joint_names:
+        if joint.movable and joint.name not in robot.joint_names:
             element.set("type", "fixed")
             origin = element.find("origin")
             assert origin is not None

@@ -40,7 +40,7 @@ from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.bodies import RigidShape
 from robotdiffuse.robots.fitting.preparation import add_robot
 from robotdiffuse.robots.parsing.urdf import UrdfTree, with_limits
-from robotdiffuse.robots.robot import MOVING_KINDS, Robot
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import ROBOT_FILE, user_robots
 from robotdiffuse.scenes.scene import without_link
 from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Sphere
@@ -137,7 +137,7 @@ class Planner:
         check_list("user_link_names", user_link_names, str, "names of links")
         robot = _robot(urdf, move_group, srdf, package_keyword_replacement or new_package_keyword)
         joints = [joint.name for joint in robot.joints]
-        movable = (joint.name for joint in robot.joints if joint.kind in MOVING_KINDS)
+        movable = (joint.name for joint in robot.joints if joint.movable)
         self.joint_names = tuple(user_joint_names or movable)
         for name in self.joint_names:
             check_name("joint in user_joint_names", name, joints)

@@ -48,6 +48,8 @@ from robotdiffuse.core.types import (
     Trajectory,
     Values,
     Vector,
+    interpolated,
+    step_lengths,
 )
 from robotdiffuse.problems.constraints import AxisCone, CartesianLine, Constraint, OnPlane, PositionBox
 from robotdiffuse.problems.problem import AnyGoal, Goal, JointGoal, PosesGoal, Problem, poses_of
@@ -603,12 +605,12 @@ def _waypoint_errors(problem: Problem, motion: Path | Trajectory, tolerances: To
             places = rows[(np.abs(motion.velocities) <= tolerances.rest).all(axis=1)]
         if blend:
             # samples on the straight lines between rows, closer together than the blend is wide
-            lengths = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1)
+            lengths = step_lengths(motion.positions)
             counts = np.clip(np.ceil(lengths / (BLEND_SHARE * blend)), 1, MAX_BLEND_SAMPLES).astype(int)
             within = [i + np.arange(count) / count for i, count in enumerate(counts)]
             places = np.concatenate([*within, rows[-1:]])
         places = places[places >= after]
-        q = np.column_stack([np.interp(places, rows, joint) for joint in motion.positions.T])
+        q = interpolated(places, rows, motion.positions)
         reached = np.flatnonzero(at_goal(robot, goal, q, tolerances, blend))
         if not len(reached):
             requirement = f"pass within {blend:g} of" if blend else "stop at"

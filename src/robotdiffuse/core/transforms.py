@@ -53,7 +53,7 @@ def quaternion_from_rotation(rotation: Rotation | Pose) -> Float[ndarray, "4"]:
 
 def xyzw_of(T: Pose) -> Float[ndarray, "4"]:
     """The rotation of a pose as a unit quaternion in the order x, y, z, w."""
-    return np.roll(quaternion_from_rotation(T[:3, :3]), -1)
+    return np.roll(quaternion_from_rotation(T), -1)
 
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Rotation:

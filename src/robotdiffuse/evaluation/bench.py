@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -139,6 +139,10 @@ RUNS_PER_TASK = 20
 """Number of runs in a task of a cluster. Each task starts the planner's process again."""
 
 
+# A record reads the files of the problem's shapes and views; a problem is planned many times.
+_record_of = lru_cache(maxsize=8)(problem_record)
+
+
 class PlannerProcess:
     """A planner in another process. The process starts with the first run, and again after it has died."""
 
@@ -162,11 +166,11 @@ class PlannerProcess:
             raise InputError(str(error)) from None
         except EndedError:
             return
-        self._ask(START_TIMEOUT, _warm_up, problem_record(run.problem))
+        self._ask(START_TIMEOUT, _warm_up, _record_of(run.problem))
 
     def plan(self, run: Run, restarts: bool = False) -> list[Fields]:
         """The fields of a run's records. A crash and an overrun also give a record."""
-        problem = problem_record(run.problem)
+        problem = _record_of(run.problem)
         # warm up first if the robot is new to the process
         answer = self._ask(START_TIMEOUT, _warm_up, problem)
         if answer is not None:

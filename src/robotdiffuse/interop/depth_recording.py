@@ -90,7 +90,7 @@ def write_depth_views(robot: Robot, views: Mapping[str, Sequence[StampedView]], 
 
 
 def _transform(parent: str, child: str, stamp: dict[str, int], T: Pose) -> JsonObject:
-    w, x, y, z = quaternion_from_rotation(T[:3, :3]).tolist()
+    w, x, y, z = quaternion_from_rotation(T).tolist()
     place = dict(zip("xyz", T[:3, 3].tolist(), strict=True))
     return {
         "header": {"stamp": stamp, "frame_id": parent},

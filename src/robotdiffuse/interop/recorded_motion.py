@@ -31,7 +31,7 @@ from robotdiffuse.core.types import (
 )
 from robotdiffuse.problems.moveit import at_state
 from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.robots.robot import MOVING_KINDS, Robot
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
 STATIONARY_TOLERANCE = 1e-6
@@ -115,7 +115,7 @@ def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
     """
     notes = list(motion.notes)
     columns = {name: j for j, name in enumerate(motion.joint_names)}
-    movable = {joint.name for joint in robot.joints if joint.kind in MOVING_KINDS}
+    movable = {joint.name for joint in robot.joints if joint.movable}
     unknown = [name for name in columns if name not in movable]
     absent = [name for name in robot.joint_names if name not in columns]
     if absent or unknown:

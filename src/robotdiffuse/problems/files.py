@@ -59,7 +59,7 @@ from robotdiffuse.problems.moveit import (
 )
 from robotdiffuse.problems.problem import Goal, JointGoal, PoseGoal, Problem, moved
 from robotdiffuse.robots import FILE_ENDINGS, ROBOTS, load_robot
-from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
+from robotdiffuse.robots.robot import MIMIC_SLACK, Robot
 from robotdiffuse.scenes.files import check_fields, read_scene
 from robotdiffuse.scenes.scene import Scene
 
@@ -283,9 +283,7 @@ def _requested(
 ) -> Problem:
     """The problem of a MoveIt request. Joints that are not planned are locked at its start state, except
     those that the problem states as `locked` (`stated`)."""
-    unplanned = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
-    unplanned -= {*robot.joint_names, *stated}
-    robot = robot.with_locked({name: value for name, value in request.start.items() if name in unplanned})
+    robot = at_state(robot, request.start, stated)
     notes = [*request.notes, *notes]
     for joint in robot.joints:
         locked = robot.locked.get(joint.name)
@@ -328,7 +326,8 @@ def _problem(
         requested = isinstance(data, dict) and "request" in data
         required = ("robot", "scene", *(("request",) if requested else ("start", "goal")))
         values = check_fields("problem", data, required, SETUP | FIELDS)
-        robot = _robot(values["robot"], values.get("locked", {}), folder, robots)
+        stated = values.get("locked", {})
+        robot = _robot(values["robot"], stated, folder, robots)
         notes = list[str]()
         robot = equipped(robot, values, folder, notes)
         base = read_pose("base", values["base"]) if "base" in values else None
@@ -342,7 +341,7 @@ def _problem(
         with located(scene_place):
             content = read_yaml(scene_place) if from_moveit else {}
             notes += scene_robot_notes(content, robot, ignore_joints)
-            robot = at_state(robot, scene_state(content) | values.get("locked", {}))
+            robot = at_state(robot, scene_state(content), stated)
             frames = moveit_frames(content, robot)
         request = None
         names = robot.link_names
@@ -374,7 +373,7 @@ def _problem(
                 mimics = {joint.name for joint in robot.joints if joint.mimic is not None}
                 current = {name: value for name, value in scene_state(content).items() if name not in mimics}
                 request = replace(request, start=current | request.start)
-                return _requested(robot, scene, request, notes, values.get("locked", {}), options)
+                return _requested(robot, scene, request, notes, stated, options)
         if base is None:
             return Problem(robot, scene, notes=tuple(notes), **options)
         return Problem.in_world(base, robot, scene, notes=tuple(notes), **options)

@@ -36,7 +36,8 @@ from robotdiffuse.core.transforms import (
 )
 from robotdiffuse.core.types import Pose, Vector, frozen_dataclass
 from robotdiffuse.robots.bodies import AttachedBody, polygon_around_circle
-from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
+from robotdiffuse.robots.kinematic_tree import MOVING_KINDS
+from robotdiffuse.robots.robot import MIMIC_SLACK, Robot
 from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.scenes.point_cloud import cover_radius, occupied_voxels
 from robotdiffuse.scenes.scene import Scene
@@ -433,10 +434,11 @@ def scene_state(data: object) -> dict[str, float]:
     return joint_state(mapping_of(SCENE, data, "robot_state"), "robot_state")
 
 
-def at_state(robot: Robot, values: Mapping[str, float]) -> Robot:
-    """The robot with the joints that are not planned, and follow no other joint, locked at these values."""
+def at_state(robot: Robot, values: Mapping[str, float], stated: Collection[str] = ()) -> Robot:
+    """The robot with the joints that are not planned, and follow no other joint, locked at these values;
+    those in `stated` keep theirs."""
     unplanned = {joint.name for joint in robot.joints if joint.movable and joint.mimic is None}
-    unplanned -= {*robot.joint_names}
+    unplanned -= {*robot.joint_names, *stated}
     return robot.with_locked({name: value for name, value in values.items() if name in unplanned})
 
 

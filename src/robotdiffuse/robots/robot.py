@@ -42,7 +42,6 @@ from robotdiffuse.robots.bodies import (
 from robotdiffuse.robots.kinematic_tree import (
     LIMITS,
     MIMIC_SLACK,
-    MOVING_KINDS,
     TURN,
     Joint,
     KinematicTree,
@@ -301,7 +300,7 @@ class Robot(KinematicTree):
                 than the joint's range, or a value of a mimic joint that contradicts the joint that it mimics.
         """
         check_type("locked", locked, Mapping, "a mapping of joints to values")
-        movable = {joint.name: joint for joint in self.joints if joint.kind in MOVING_KINDS}
+        movable = {joint.name: joint for joint in self.joints if joint.movable}
         for name, value in locked.items():
             check_name("joint in locked", name, movable)
             number = isinstance(value, Real) and not isinstance(value, bool)

@@ -41,7 +41,7 @@ from robotdiffuse.core.types import (
 from robotdiffuse.drawables import Drawable, drawables
 from robotdiffuse.problems.problem import moving_obstacles
 from robotdiffuse.robots.kinematic_tree import Joint
-from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Robot, moving_pairs
+from robotdiffuse.robots.robot import ConvexMesh, Robot, moving_pairs
 from robotdiffuse.scenes.scene import MovingObstacle, Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere, Triangulated
 
@@ -114,7 +114,7 @@ class World:
         self.held = {
             indices[joint.name]: robot.locked.get(joint.name, 0.0)
             for joint in robot.joints
-            if joint.kind in MOVING_KINDS and joint.name not in robot.joint_names
+            if joint.movable and joint.name not in robot.joint_names
         }
         """Values of the joints that planning does not move, by PyBullet's index."""
         solid = [link for link in robot.link_names if robot.meshes.get(link)]
@@ -309,7 +309,7 @@ def _add_joint(root: Xml.Element, joint: Joint, planned: bool) -> None:
     Xml.SubElement(element, "child", link=joint.child)
     T = joint.T_parent_joint
     Xml.SubElement(element, "origin", xyz=_numbers(T[:3, 3]), rpy=_numbers(rpy_from_rotation(T[:3, :3])))
-    if joint.kind in MOVING_KINDS:
+    if joint.movable:
         Xml.SubElement(element, "axis", xyz=_numbers(joint.axis))
         # in Bullet, a lower limit above the upper one means no limits
         bounded = planned and joint.kind != "continuous"
