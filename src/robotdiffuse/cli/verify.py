@@ -6,13 +6,13 @@ from pathlib import Path
 from robotdiffuse.cli.arguments import Namespace
 from robotdiffuse.cli.console import clearances
 from robotdiffuse.core.errors import InputError, counted, joined, located
-from robotdiffuse.core.files import check_output, read_yaml
+from robotdiffuse.core.files import check_output
 from robotdiffuse.core.types import NO_PROBLEM, PlanResult, Trajectory, load_result
 from robotdiffuse.core.types import Path as Waypoints
 from robotdiffuse.interop import check_export, read_motion, write_motion
 from robotdiffuse.interop.recorded_motion import motion_of_robot, problem_of_motion, publish
 from robotdiffuse.problems.files import load_problem, problem_from_record
-from robotdiffuse.problems.moveit import at_state, read_moveit_scene, scene_state
+from robotdiffuse.problems.moveit import read_moveit_scene
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import DATA, ROBOTS, load_robot
 from robotdiffuse.robots.robot import Robot
@@ -128,8 +128,7 @@ def _read(
         problem = load_problem(arguments.problem, arguments.index, arguments.ignore_joints)
     else:
         robot = load_robot(arguments.robot)
-        scene, scene_notes = read_moveit_scene(str(arguments.scene), robot, arguments.ignore_joints)
-        robot = at_state(robot, scene_state(read_yaml(str(arguments.scene))))
+        scene, robot, scene_notes = read_moveit_scene(str(arguments.scene), robot, arguments.ignore_joints)
         problem = problem_of_motion(recorded, robot, scene)
     with located(arguments.motion):
         converted = motion_of_robot(recorded, problem.robot)

@@ -142,9 +142,10 @@ def frame_name(where: str, entry: JsonObject) -> str:
 
 def read_moveit_scene(
     file: str | Path, robot: Robot, ignore_joints: bool = False
-) -> tuple[Scene, tuple[str, ...]]:
-    """The collision objects of a planning scene, in the frame of the robot's base, and notes on differences
-    between the scene's robot and `robot`.
+) -> tuple[Scene, Robot, tuple[str, ...]]:
+    """The collision objects of a planning scene, in the frame of the robot's base; the robot with the joints
+    that are not planned at their values in robot_state; and notes on differences between the scene's robot
+    and `robot`.
 
     The pose of the root of the robot's URDF comes from robot_state.multi_dof_joint_state, and the pose of the
     base relative to this root from `robot`. Other known frames are those in fixed_frame_transforms and the
@@ -158,7 +159,9 @@ def read_moveit_scene(
     data = read_yaml(file)
     with located(file):
         notes = scene_robot_notes(data, robot, ignore_joints)
-        return moveit_scene(data, moveit_frames(data, robot), Path(file).parent, robot.link_names), notes
+        robot = at_state(robot, scene_state(data))
+        scene = moveit_scene(data, moveit_frames(data, robot), Path(file).parent, robot.link_names)
+        return scene, robot, notes
 
 
 class MoveItFrames(dict[str, ndarray]):

@@ -108,8 +108,7 @@ def timed(motion: Path | Trajectory) -> tuple[Values, Configurations]:
     """Times [s] and positions of a motion; a path without times gets a constant speed in joint space."""
     if isinstance(motion, Trajectory):
         return motion.times, motion.positions
-    steps = step_lengths(motion.positions) / UNTIMED_SPEED
-    return np.concatenate([[0.0], np.cumsum(steps)]), motion.positions
+    return arc_lengths(motion.positions) / UNTIMED_SPEED, motion.positions
 
 
 def check_motion_of(robot: Robot, motion: Path | Trajectory) -> None:

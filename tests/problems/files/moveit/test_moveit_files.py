@@ -196,7 +196,7 @@ def test_a_scene_and_a_problem_file_allow_contacts(tmp_path: Path) -> None:
     names = [entry["id"] for entry in data["world"]["collision_objects"]]
     data["allowed_collision_matrix"] = matrix(["panda_hand", names[0], "gone"], [("panda_hand", names[0])])
     file.write_text(yaml.safe_dump(data))
-    scene, _ = moveit.read_moveit_scene(file, PANDA)
+    scene, *_ = moveit.read_moveit_scene(file, PANDA)
     assert scene.allowed_contacts == ((names[0], ("panda_hand",)),)
     problem = {"robot": "panda", "scene": "scene0001.yaml", "request": "request0001.yaml"}
     loaded = rd.load_problem(write_record(tmp_path, problem | {"allowed_contacts": {names[1]: "all"}}))
