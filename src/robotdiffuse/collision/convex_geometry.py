@@ -16,7 +16,7 @@ from robotdiffuse.collision.kernels.convex_bounds import Hulls, Solids
 from robotdiffuse.core.transforms import ball_around, placed, transform
 from robotdiffuse.core.types import Points, Pose, Vector
 from robotdiffuse.robots.kinematic_tree import once_per_robot
-from robotdiffuse.robots.robot import Robot, moving_pairs
+from robotdiffuse.robots.robot import Robot, pairs_to_check
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
@@ -89,9 +89,7 @@ def checks_of(robot: Robot) -> tuple[Check, ...]:
     """The moving links against the scene, then the pairs of links that may not collide."""
     links = list(parts_of(robot))
     moving = (Check(link, None) for link in links if robot.link_frame(link) > 0)
-    pairs = (
-        Check(*pair) for pair in moving_pairs(robot, links) if frozenset(pair) not in robot.allowed_collisions
-    )
+    pairs = (Check(*pair) for pair in pairs_to_check(robot, links))
     return (*moving, *pairs)
 
 

@@ -275,11 +275,7 @@ class Robot(KinematicTree):
             Pairs in which both links have spheres and are fixed to different frames, without those in
             `allowed_collisions`.
         """
-        return tuple(
-            pair
-            for pair in moving_pairs(self, self.spheres)
-            if frozenset(pair) not in self.allowed_collisions
-        )
+        return tuple(pairs_to_check(self, self.spheres))
 
     def with_locked(self, locked: dict[str, float]) -> "Robot":
         """Lock joints at values. Joints that mimic them follow.
@@ -592,6 +588,11 @@ def moving_pairs(robot: Robot, names: Container[str]) -> list[tuple[str, str]]:
     """Pairs of links with these names that are fixed to different frames."""
     links = [link for link in robot.link_names if link in names]
     return [(a, b) for a, b in combinations(links, 2) if robot.link_frame(a) != robot.link_frame(b)]
+
+
+def pairs_to_check(robot: Robot, names: Container[str]) -> list[tuple[str, str]]:
+    """The `moving_pairs` that may not collide."""
+    return [pair for pair in moving_pairs(robot, names) if frozenset(pair) not in robot.allowed_collisions]
 
 
 def check_robot(robot: object) -> None:

@@ -41,7 +41,7 @@ from robotdiffuse.core.types import (
 from robotdiffuse.drawables import Drawable, drawables
 from robotdiffuse.problems.problem import moving_obstacles
 from robotdiffuse.robots.kinematic_tree import Joint
-from robotdiffuse.robots.robot import ConvexMesh, Robot, moving_pairs
+from robotdiffuse.robots.robot import ConvexMesh, Robot, pairs_to_check
 from robotdiffuse.scenes.scene import MovingObstacle, Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere, Triangulated
 
@@ -120,9 +120,7 @@ class World:
         solid = [link for link in robot.link_names if robot.meshes.get(link)]
         self.moving = [link for link in solid if robot.link_frame(link) > 0]
         """Links with geometry that a planned joint moves."""
-        self.pairs = [
-            pair for pair in moving_pairs(robot, solid) if frozenset(pair) not in robot.allowed_collisions
-        ]
+        self.pairs = pairs_to_check(robot, solid)
         """Pairs of links that are checked against each other."""
         for a, b in combinations(solid, 2):
             if (a, b) not in self.pairs:
