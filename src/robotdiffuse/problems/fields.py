@@ -118,7 +118,7 @@ GOALS = {
 TOOL_FIELDS = {"link": TEXT, "name": TEXT, **POSE, "shapes": _array(SHAPE), "touch_links": TEXTS}
 PAYLOAD_FIELDS = {"mass": NUMBER, "com": NUMBERS, "link": TEXT, "moments": NUMBERS}
 MOTION_FIELDS = ("velocity", "times", "poses", "max_speed")
-WRITTEN_DECIMALS = 12
+WRITTEN_DECIMALS = 15
 """Decimals of computed poses in files. Rounding restores the values that a user wrote, e.g. 0.3 for
 0.30000000000000004."""
 

@@ -154,7 +154,7 @@ def problem_record(
     """Convert a problem to JSON values.
 
     Numbers are kept exactly, except that the poses of base and tool and, with a base, all numbers of fields
-    in the frame of the world have 12 decimals.
+    in the frame of the world have 15 decimals.
 
     Args:
         problem: The problem.
