@@ -101,8 +101,8 @@ def _repeated_interrupts() -> Iterator[None]:
 
 @_repeated_interrupts()
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status; bad input is reported on standard error, in one line and
-    the `listed` lines of the InputError."""
+    """Run one command and return its exit status. Bad input is reported on standard error: one line, then the
+    further lines of the InputError (its argument `listed`), if it has any."""
     _prepare_streams()
     try:
         arguments = build_parser().parse_args(argv)
@@ -117,7 +117,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refused(f"not enough memory; use smaller numbers. {error}")
     except (KeyboardInterrupt, SystemError) as error:
         cause: BaseException | None = error
-        while isinstance(cause, SystemError):  # as which Ctrl-C can leave compiled code
+        while isinstance(cause, SystemError):  # Ctrl-C in compiled code can arrive as one
             cause = cause.__cause__
         if not isinstance(cause, KeyboardInterrupt):
             raise
@@ -136,7 +136,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _refused(why: object, status: int = BAD_INPUT) -> int:
-    """Report an error in one line; returns the exit status."""
+    """Report an error on standard error, and return the exit status."""
     print(f"robotdiffuse: error: {why}", file=sys.stderr)
     return status
 

@@ -86,7 +86,7 @@ def run_report(arguments: Namespace) -> None:
 
 
 def _write_replays(motions: list[Replay], file: Path) -> None:
-    """Writes the motions of the first motion's robot."""
+    """Writes a page with the motions of the first motion's robot: a page shows one robot."""
     robot = motions[0].case.problem.robot
     entries = [
         GalleryEntry(

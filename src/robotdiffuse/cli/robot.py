@@ -34,6 +34,7 @@ def run_list(arguments: Namespace) -> None:
             continue
         spheres = sum(map(len, robot.spheres.values()))
         weights = "no" if weights_for("model", robot) is None else "yes"
+        # the fraction of free configurations in which spheres collide falsely
         false_share = read_source(place).get("refused")
         rows.append((name, robot.dof, spheres, len(robot.checked_pairs()), false_share, weights, str(place)))
     false_column = Column("false collisions", "%", ".1f", scale=100.0)

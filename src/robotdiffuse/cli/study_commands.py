@@ -207,7 +207,7 @@ TRAIN = Command(
                 ),
                 ("--robot NAME", "bundled name or URDF of the robot (default: panda)"),
                 ("--trajectories N", "motions to generate, without --data (default: 60,000)", count),
-                ("--workers N", "processes that generate data without --data (all cores)", count),
+                ("--workers N", "processes that generate data, without --data (default: all cores)", count),
                 (
                     "--out FOLDER",
                     f"{OUT[1]}; without --data also for the data (default: beside the user's robots)",
@@ -226,7 +226,8 @@ TRAIN = Command(
                         ("--objective NAME", "what the denoiser predicts: clean or noise"),
                         (
                             "--target NAME",
-                            "what motions are relative to: residual (the straight line), absolute or limits",
+                            "what is subtracted from motions: residual (the straight line), absolute (the "
+                            "mean of the data) or limits (nothing)",
                         ),
                         ("--sampling-steps N", "denoising steps for planning", count),
                         (
@@ -321,7 +322,7 @@ BENCH = Command(
                 ("folder FOLDER", "folder of `robotdiffuse bench run`"),
                 (
                     "--limits S,...",
-                    "time limits [s] (default: those of the run, and 0.1, 1, 10, 60 below them)",
+                    "time limits [s] (default: those of the run, and those of 0.1, 1, 10, 60 below them)",
                     positives,
                 ),
                 ("--planners NAME,...", "planners to include (default: all)", names),

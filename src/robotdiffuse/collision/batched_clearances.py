@@ -21,8 +21,8 @@ _NO_BOX_CORNER = np.float32(EMPTY_BOX[0, 0])
 
 @inner_kernel()
 def _scene(empty, floors, floor, kinds, params, solids, around):
-    """Writes a packed scene to the buffers `solids` and `around`, and returns its SceneArrays, whose
-    docstrings describe their rows. `floor` is the row of `floors` that becomes the first solid; -1: no
+    """Writes a packed scene to the buffers `solids` and `around`, and returns its SceneArrays, in which they
+    are `solids` and `solid_boxes`. `floor` is the row of `floors` that becomes the first solid; -1: no
     floor."""
     n = 0
     if floor >= 0:

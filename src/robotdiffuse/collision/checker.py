@@ -55,7 +55,7 @@ class CollisionChecker:
     def clearances_and_gradients(
         self, q: Float[ndarray, "n dof"], limit: float, margin: float
     ) -> tuple[Float[ndarray, "n links"], Float[ndarray, "n dof"]]:
-        """`link_clearances`, and the gradient of the arm's margin violation by joint positions [m/rad].
+        """`link_clearances`, and the gradient of the arm's margin violation with respect to q [m/rad].
 
         The violation is sqrt(sum of h²) over the covering spheres. A sphere at signed distance D from the
         scene contributes h = max(0, margin - D). Violation and gradient are 0 where no sphere is within

@@ -87,8 +87,8 @@ def noise_factor(
     the first and the last waypoint, and its mean variance between them is 1.
 
     residuals: trajectories relative to their reference, scaled to unit variance. smooth: if true, L Lᵀ is the
-    covariance of the residuals over the waypoints, plus a little white noise so that it has full rank; if
-    false, L is `white_noise_factor`.
+    covariance of the residuals over the waypoints between these two, plus a little white noise so that it has
+    full rank there; if false, L is `white_noise_factor`.
     """
     waypoints = residuals.shape[1]
     white = white_noise_factor(waypoints)

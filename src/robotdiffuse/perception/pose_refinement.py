@@ -2,11 +2,10 @@
 inexact poses by the arm, known shapes, and surfaces that several images show.
 
 Each point is matched with the nearest point of a surface; its error is their distance along the surface's
-normal (Y. Chen and G. Medioni, "Object modelling by registration of multiple range images", 1992). In the
-estimate from views of the arm, errors are weighted by Geman and McClure's function, whose width shrinks from
-round to round. In the refinement, the unknowns are the error of each camera's pose, which is constant in the
-camera's frame, and the distance between the arm's surface and its model; the stated `pose_deviation` serves
-as the prior.
+normal (Y. Chen and G. Medioni, "Object modelling by registration of multiple range images", 1992). Errors are
+weighted by Geman and McClure's function, whose width shrinks from round to round. In the refinement, the
+unknowns are the error of each camera's pose, which is constant in the camera's frame, and the distance
+between the arm's surface and its model; the stated `pose_deviation` serves as the prior.
 """
 
 from collections.abc import Iterator, Sequence
@@ -202,8 +201,8 @@ ALIKE = 0.8
 FACING = 0.4
 """Smallest cosine of the angle between the arm's normal and the ray."""
 GATES = (1.0, 0.7, 0.5, 0.3, 0.2, 0.2)
-"""One factor for each round. Matched points are at most this factor times `_Image.shift`, plus NOISES
-standard deviations of their noise, from the surface."""
+"""One factor for each round. Matched points are closer to the surface than this factor times `_Image.shift`,
+plus NOISES standard deviations of their noise."""
 NOISES = 3.0
 POINTS_PER_ERROR = 4
 """Number of points that count as one independent measurement."""
@@ -230,8 +229,8 @@ DEPTHS = np.arange(0.2, 3.0, 0.2)
 NEAR = 0.6
 """Up to this distance, the whole error of a refined pose counts as an error of its position [m]."""
 SAME_CAMERA = 0.1
-"""A camera is that of a nominal pose on the arm if no entry of its pose differs by more: [m], or without unit
-for the rotation."""
+"""A camera counts as the one on the arm if each entry of its pose differs from the nominal pose by less than
+this: [m], without unit for the rotation."""
 
 
 class _Match(NamedTuple):
@@ -306,8 +305,9 @@ class PoseRefinement:
             return view
         earlier = [image for image in self._images if image.camera == number]
         if len(earlier) < MAX_VIEWS and all(np.abs(s.configuration - q).max() > MIN_TURN for s in earlier):
-            shows_scene = self._cameras[number].link is not None or not earlier
-            image = self._image(view, q, number, shows_scene)
+            # a camera beside the arm sees the same scene in each image: only that of its first image counts
+            use_scene = self._cameras[number].link is not None or not earlier
+            image = self._image(view, q, number, use_scene)
             if len(image.points):
                 self._images.append(image)
                 self._fit()
@@ -328,7 +328,7 @@ class PoseRefinement:
 
     def _camera(self, view: DepthView) -> int | None:
         """The index of a view's camera, which is added if it is new. None if there are MAX_CAMERAS others, or
-        if the view states no error of its pose, is of a cloud or lacks the configuration."""
+        if the view states no error of its pose, was made from a cloud, or lacks the configuration."""
         q = view.configuration
         if not any(view.pose_deviation) or view.cloud is not None or q is None:
             return None
@@ -346,7 +346,7 @@ class PoseRefinement:
         self._cameras.append(camera)
         return len(self._cameras) - 1
 
-    def _image(self, view: DepthView, q: Configuration, camera: int, shows_scene: bool) -> _Image:
+    def _image(self, view: DepthView, q: Configuration, camera: int, use_scene: bool) -> _Image:
         T = view.T_base_camera
         points = _block_points(view)
         normals, flat = _normals(points)
@@ -355,7 +355,7 @@ class PoseRefinement:
         on_arm = sphere_distances(placed(T, points), spheres) < ARM_DISTANCE
         arm = on_arm if self._cameras[camera].link is None else np.zeros(len(points), np.bool_)
         use = np.zeros(len(points), np.bool_)
-        for usable in (arm, flat & ~on_arm & shows_scene):
+        for usable in (arm, flat & ~on_arm & use_scene):
             at = np.flatnonzero(usable)
             use[at[:: max(1, -(-len(at) // MAX_POINTS))]] = True
         points = points[use]

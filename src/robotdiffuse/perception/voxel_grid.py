@@ -73,7 +73,7 @@ class VoxelGrid:
 
     def enclose(self, marked: Voxels, points: Points, distance: "float | Float[ndarray, 'n']") -> Mask:
         """Whether each point is in a marked voxel, with marked voxels on all six sides at a distance [m]."""
-        sides = np.vstack([np.eye(4, 3), -np.eye(3)])  # the fourth is zero
+        sides = np.vstack([np.eye(4, 3), -np.eye(3)])  # row 3 is zero: the point
         return np.all([self.hold(marked, points + np.outer(distance, side)) for side in sides], axis=0)
 
     def filled(self, robot: Robot, configurations: Iterable[Configuration], margin: float = 0.0) -> Voxels:

@@ -199,10 +199,11 @@ def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
     """The start and the goals for the search of a call; a failed result if there are none.
 
     A pose gives at most `pose_goals.GOAL_COUNT` configurations whose covering spheres are free. At most
-    MAX_GRAZING_GOALS configurations are added whose covering spheres collide but whose exact meshes are free,
-    if they are nearer to the start; then copies of all with whole turns. Of a JointGoal, configurations with
-    only the meshes free are used if none has free spheres.
-    Several goals are tried with little work each; only if none is free, they are tried again with more.
+    MAX_GRAZING_GOALS configurations whose covering spheres collide, but whose exact meshes are free, are
+    added if they are nearer to the start than all of those. Then copies of all with whole turns are added.
+    Of a JointGoal, configurations whose spheres collide but whose meshes are free are used only if no
+    configuration has free spheres. Several goals are tried with little work each. If no goal is free, or the
+    payload cannot be held at any that is, they are tried again with more work.
     """
     robot = context.problem.robot
     scene = context.problem.scene
@@ -218,7 +219,7 @@ def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
     constraints = context.validator.constraints
     wrong = None if constraints is None else constraints.worst_violation(start)
     if wrong is not None:
-        return context.fail(Status.INVALID_START, f"the start does not keep the constraints: {wrong.message}")
+        return context.fail(Status.INVALID_START, f"the start violates the constraints: {wrong.message}")
     heavy = _too_heavy(context, start)
     if heavy is not None:
         return context.fail(Status.INVALID_START, f"the payload cannot be held at the start: {heavy}")
@@ -367,7 +368,7 @@ def _free_goals(
         if not satisfied.any():
             wrong = constraints.worst_violation(positions[0])
             assert wrong is not None
-            reason = f"{_all_goals(positions, 'does', 'do')} not keep the constraints: {wrong.message}"
+            reason = f"{_all_goals(positions, 'violates', 'violate')} the constraints: {wrong.message}"
             return context.fail(Status.INVALID_GOAL, reason)
         positions = positions[satisfied]
     free = checker.free(positions)

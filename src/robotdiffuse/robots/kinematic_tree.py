@@ -266,7 +266,7 @@ class KinematicTree(Value):
         In the first row, each such joint is as close to `start` as possible. In each further row, one such
         joint reaches `q` by turning in the other direction, since obstacles may block the short way. If
         several continuous joints of the first row are more than half a turn from 0, a last row has all of
-        them within half a turn of 0, since elbows fold at half a turn.
+        them within half a turn of 0, since elbows cannot turn past half a turn.
         """
         nearest = self._turned(q, start, joints)
         rows = [nearest]

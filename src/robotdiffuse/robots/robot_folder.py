@@ -52,7 +52,7 @@ def user_robots() -> Path:
     chosen = os.environ.get("ROBOTDIFFUSE_ROBOTS")
     if chosen:
         return Path(chosen)
-    # a user without a home, as in a container, gets a folder in /, which cannot be written
+    # without a home, as in a container: a folder in /, not one named ~ in the working folder
     data = os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share").lstrip("~")
     return Path(data, "robotdiffuse", "robots")
 
@@ -76,9 +76,9 @@ def write_robot_folder(robot: Robot, folder: Path, source: JsonObject) -> None:
     """Write meshes.npz, for grazing links surfaces.npz, and robot.json into a folder. Each file is written
     atomically; other files in the folder stay.
 
-    `source` describes the robot's origin by the keys urdf, sha256 and license; also by srdf, the digest of
-    the SRDF that belongs to the URDF, unless another SRDF was given. If preparation measured them, it also
-    has `free`, the fraction of configurations that are free, and `refused`, the fraction of the free
+    `source` describes the robot's origin by the keys urdf, sha256 and license. If no SRDF but the one that
+    belongs to the URDF was given, it also has srdf, the digest of that SRDF. If preparation measured them, it
+    also has `free`, the fraction of configurations that are free, and `refused`, the fraction of the free
     configurations in which covering spheres collide falsely. Raises InputError if the folder cannot be
     written.
     """
@@ -121,7 +121,6 @@ def read_robot_folder(folder: Path) -> Robot:
     with reading(folder / ROBOT_FILE):
         robot = _from_json(data, meshes)
         _check_tree(robot)
-        robot.frame_offsets  # noqa: B018  (walks the tree: fails if a joint has no parent)
         if robot.dof == 0 or not {*robot.spheres, *robot.inertias} <= {*robot.link_names}:
             raise ValueError("no planned joints, or spheres or inertias of an unknown link")
     file = folder / SURFACE_FILE

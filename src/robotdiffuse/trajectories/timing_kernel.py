@@ -269,8 +269,9 @@ def _bounds_of_next(first, second, i, width, x, max_next, lowest, highest):
 
     first, second, lowest, highest: as in `controllable`. width: of the interval. max_next: greatest y.
 
-    Returns intercept and slope of the lower bound, intercept and slope of the upper bound (not their values
-    at x, where both parts may cancel), and the greatest x by those limits that y does not influence.
+    Returns intercept and slope of the lower bound, intercept and slope of the upper bound, and the greatest
+    x by those limits that y does not influence. Intercept and slope are separate, since in a bound's value at
+    x, the intercept and slope * x may cancel.
     """
     high = max_next
     high_slope = 0.0
@@ -353,8 +354,8 @@ def fastest_speeds(first, second, grid, velocity, lowest, highest, start_speed=0
         width = grid[i + 1] - grid[i]
         high, slope = _bounds_of_next(first, second, i, width, x, max_x[i + 1], lowest, highest)[2:4]
         # Rounding errors must not stop the motion. From max_x[i], the backward pass made a next x possible of
-        # MIN_SPEED_RATIO times the smaller one of max_x[i] and max_x[i + 1]; from a smaller x, the next x is
-        # at least proportionally less.
+        # MIN_SPEED_RATIO times the smaller one of max_x[i] and max_x[i + 1]; from a smaller x, x / max_x[i]
+        # times that next x is possible.
         min_next = MIN_SPEED_RATIO * x * min(1.0, max_x[i + 1] / max_x[i])
         x = min(max(high + slope * x, min_next), max_x[i + 1])
     return speeds

@@ -183,7 +183,7 @@ is trained with the planner's loss, on new clouds in every batch."""
 
 
 def make_encoder(name: str, settings: EncoderSettings | None = None) -> Any:
-    """An untrained encoder of this name; settings: None: the encoder's defaults."""
+    """An untrained encoder of this name. If `settings` is None, it has the encoder's defaults."""
     return ENCODERS.load(name)(settings or ENCODERS.defaults(name))
 
 

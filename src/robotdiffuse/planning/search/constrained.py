@@ -172,7 +172,7 @@ def between(space, limits, a, b, most, scratch):
         middle[:] = 0.5 * (current + target)
         if not project(limits.rows, limits.row_limits, middle, limits.work):
             return 0
-        # a middle that is far from both ends is on another branch of the solutions
+        # a middle that is far from one of the ends is on another branch of the solutions
         if max(distance(current, middle), distance(middle, target)) > MAX_DRIFT * gap:
             return 0
         top += 1

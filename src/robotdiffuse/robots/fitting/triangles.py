@@ -11,10 +11,10 @@ Triangles = Float[ndarray, "_ 3 3"]
 
 def split(triangles: Triangles, size: "float | Float[ndarray, 'n']", reach: float = np.inf) -> Triangles:
     """Cut triangles in two at their longest edge until no edge is longer than `size` [m], a number or one per
-    triangle. The cut is in the middle of the edge. In a narrow triangle it is placed so that the piece at the
-    narrow end needs no further cut: with halving alone, the number of pieces of a needle grows with its
-    length to the power of 1.6. A triangle is left out if its middle is farther from the origin than its
-    longest edge plus `reach` [m]."""
+    triangle. The cut is in the middle of the edge. In a narrow triangle it is placed so that the piece
+    beside the shortest edge needs no further cut: with halving alone, the number of pieces of a needle grows
+    with its length to the power of 1.6. A triangle is left out if its middle is farther from the origin than
+    its longest edge plus `reach` [m]."""
     sizes = np.broadcast_to(np.asarray(size, np.float64), len(triangles))
     return _split(np.ascontiguousarray(triangles, np.float64), sizes**2, reach)
 
