@@ -18,7 +18,8 @@ Differences from the papers, with the papers' values:
   in EDMP (MPD adds velocities), scaled to the joint limits, as in both.
 - T = 255 levels of the cosine schedule, as EDMP. MPD trains with 25 levels of an exponential schedule; its
   sampler here takes the 25 of our levels that are nearest to them in signal-to-noise ratio.
-- Width 32 at resolutions 1, 2, 4 (0.7 million parameters); MPD has width 32 at 1, 2, 4, 8 (about 4 million).
+- 32, 64 and 128 channels at three resolutions (0.7 million parameters); MPD has 256 at a fourth one, too
+  (about 4 million).
   Our network trains at 1,200 samples/s on a CPU core. It has layer norms over channels, and the condition
   scales and shifts the features; the papers have group norms and add a time embedding.
 - Trained on trajectories of all scenes, as EDMP; MPD trains a prior per environment. A tenth of each batch
@@ -42,7 +43,7 @@ Settings here, and in the paper or its code:
 | gradient steps per denoising step | 5 | 5 |
 | factor on the noise of a step | 0.5 | 0.5 |
 | configurations per waypoint in the collision cost | 2 | 1.5 |
-| weights of the costs | below | for other units and distances |
+| weights of the costs | constants below | others, for other units and distances |
 
 Other differences: our compiled kernel computes signed distances of covering spheres; the paper uses a
 distance grid. Our Gaussian process is over positions, with the velocities integrated out, and its gradient
@@ -299,8 +300,8 @@ class MPDSettings(PriorSettings, name="mpd"):
     """Settings of MPD. The noise levels are spaced as in the paper's exponential schedule."""
 
     guided_share: Share = 0.25
-    """Fraction of the denoising steps that are guided: the last ones. The steps without noise are always
-    guided."""
+    """Fraction of the denoising steps that are guided: the last ones. The steps without noise are guided
+    too, unless this is 0."""
     margin: NotNegative = 0.04
     """Distance of spheres to obstacles below which there is a collision cost [m]."""
     between: Natural = 1
@@ -391,7 +392,7 @@ class GuideSettings(Settings, name="edmp.guides"):
     """Number of configurations between two waypoints at which the cost is evaluated: 0 for the intersection
     cost, more for the swept-volume cost."""
     far_margin: NotNegative
-    """Margin by which obstacles are expanded at the first guided step [m]."""
+    """Margin by which obstacles are expanded just before the first guided step [m]."""
     near_margin: NotNegative
     """Margin at the last guided step [m]. The margin falls linearly from `far_margin` to `near_margin`."""
     weight: NotNegative
@@ -425,7 +426,7 @@ class EDMPSettings(PriorSettings, name="edmp"):
         super().__post_init__()
         if self.samples < len(self.guides):
             raise InputError(
-                f"edmp.samples is {self.samples} and guides are {len(self.guides)}; each needs a sample"
+                f"edmp.samples is {self.samples}; it must be at least {len(self.guides)}, one for each guide"
             )
 
     def shares(self) -> list[slice]:

@@ -207,7 +207,7 @@ def _gaps(proof: StretchProof, last: float) -> Iterator[str]:
         start = stretches.start[rows]
         stop = stretches.stop[rows]
         edges = np.concatenate([[0.0], stop]), np.concatenate([start, [last]])
-        # A motion of one row needs a stretch too; without one, both edges are row 0, so there is no gap.
+        # A motion of one row needs a stretch too. If it is missing, the edges do not differ: both are 0.
         broken = np.flatnonzero((edges[0] != edges[1]) | np.append(stop < start, not len(rows)))
         if len(broken):
             low, high = (float(side[broken[0]]) for side in edges)

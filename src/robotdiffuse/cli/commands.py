@@ -216,8 +216,8 @@ CHECKS = (
     Command(
         "verify",
         "validate a motion from any source",
-        "Validate a motion from any planner: a RobotDiffuse result, CSV, JSON, YAML of a ROS "
-        "JointTrajectory or MoveIt RobotTrajectory, a ROS 2 bag or MCAP. Exit status: 0 valid, 1 not valid, "
+        "Validate a motion from any planner: a RobotDiffuse result, a CSV table, a ROS 2 bag, MCAP, and JSON "
+        "or YAML with a ROS JointTrajectory or MoveIt RobotTrajectory. Exit status: 0 valid, 1 not valid, "
         "2 bad input.",
         "verify:run_verify",
         (

@@ -29,7 +29,7 @@ def draw(problem: Problem, result: PlanResult | None, file: Path) -> None:
     """Draw the motion of a result in its scene, as a replay or a picture by the ending of the file; without a
     motion, draw the start, the goal and the links that collide.
 
-    For a problem with views and the policy `predicted`, the predicted obstacles are drawn too.
+    With a motion, the predicted obstacles of a problem with the policy `predicted` are drawn too.
     """
     if result is None or result.path is None:
         return write_problem(problem, file, result)

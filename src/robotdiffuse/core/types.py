@@ -397,9 +397,8 @@ class Trajectory(Value):
         At a low rate, the cubics between the new rows may need larger accelerations than this motion has,
         where its acceleration changes quickly. A motion from rest to rest is then averaged: its rows lie on
         the uniform cubic B-spline that has the resampled positions as control points. An averaged motion
-        leaves the path by up to a sixth of the acceleration divided by rate², and lasts up to three steps
-        longer, and two for each stop. Validate the returned motion: between its rows it may differ from this
-        one.
+        leaves the path by up to acceleration / (6 rate²). It lasts up to three steps longer, plus two for
+        each stop. Validate the returned motion: between its rows it may differ from this one.
 
         Args:
             rate: Rows in a second [Hz], above 0 and at most 100,000.

@@ -153,8 +153,8 @@ def read_moveit_scene(
     its entries for two links are ignored, because the robot has its own pairs of links to check.
 
     Raises InputError, naming file and object, for a missing or damaged file, unknown fields and frames,
-    shapes that are not supported (prisms, octomaps that are not binary, meshes that are not files), objects
-    attached to robot_state, and, unless `ignore_joints`, joints that the robot lacks.
+    shapes that are not supported (prisms, octomaps that are not binary, mesh resources that are not files),
+    objects attached to robot_state, and, unless `ignore_joints`, joints that the robot lacks.
     """
     data = read_yaml(file)
     with located(file):
@@ -227,7 +227,8 @@ def moveit_frames(data: object, robot: Robot) -> MoveItFrames:
         child = str(entry.get("child_frame_id", "")).removeprefix("/")
         T = pose_of(f"{location}.transform", entry.get("transform"), "translation", "rotation")
         frame = frame_name(location, entry)
-        if frame and child in frames:  # as MoveIt writes them: the header's frame in the planning frame
+        # as MoveIt writes them: T is the pose of the header's frame in the child frame, the planning frame
+        if frame and child in frames:
             frames |= {} if frame in frames.links else {frame: frames[child] @ T}
         elif not frames.unknown_reason and child not in frames.links:
             frames[child] = frames.of_header(location, entry) @ T
@@ -261,7 +262,8 @@ def moveit_scene(
     allowed = matrix_contacts(mapping_of(SCENE, data, MATRIX), names, links)
     scene = Scene(shapes, allowed)
     additional = Scene(shapes, contacts).allowed_contacts  # type: ignore[arg-type]
-    # both name the renamed shapes, of which one may have the name that another was given
+    # Both name the shapes by their unique names, which the scene here must have too: a unique name may be the
+    # name that another one of `shapes` was given.
     return Scene(scene.shapes, (*scene.allowed_contacts, *additional))
 
 

@@ -105,8 +105,9 @@ def _residuals(rows, limits, q, work):
                     for i in range(3):
                         entry += ANGLE_WEIGHT * work.axes[k, i] * work.error[i] / sine
                 else:
-                    # the axis of the CONE is opposite to its direction: any rotation axis reduces the angle
-                    entry = ANGLE_WEIGHT * work.axes[k, 0]
+                    # the axis of the CONE is opposite to its direction: a turn about any axis across the
+                    # direction reduces the angle, hence also about (1, 1, 1)
+                    entry = ANGLE_WEIGHT * np.sum(work.axes[k])
                 work.J[count, rows.chain[m, k]] = entry
             count += 1
     return count

@@ -591,7 +591,7 @@ def moving_pairs(robot: Robot, names: Container[str]) -> list[tuple[str, str]]:
 
 
 def pairs_to_check(robot: Robot, names: Container[str]) -> list[tuple[str, str]]:
-    """The `moving_pairs` that may not collide."""
+    """The `moving_pairs` that are not in `robot.allowed_collisions`."""
     return [pair for pair in moving_pairs(robot, names) if frozenset(pair) not in robot.allowed_collisions]
 
 

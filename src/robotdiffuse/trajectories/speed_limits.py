@@ -358,8 +358,8 @@ def derivatives_and_limits(
     and highest accelerations.
 
     Extra limits are further columns of the same form, as if they were joints. A frame speed is proportional
-    to ṡ; the factor is its q', and it has no acceleration limits. A torque is a s̈ + b ṡ² + gravity, all
-    divided by the torque limit: a is its q', b is its q'', and its acceleration limits are ±1 minus gravity.
+    to ṡ; the factor is its q', and it has no acceleration limits. A torque is `a` s̈ + `b` ṡ² + gravity, all
+    divided by the torque limit: `a` is its q', `b` its q'', and its acceleration limits are ±1 minus gravity.
     It has no velocity limit.
     """
     first = line(grid, 1)

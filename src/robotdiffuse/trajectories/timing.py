@@ -325,8 +325,8 @@ class StopGraph:
 
     def sample(self, radii: JointValues, travel: float) -> tuple[Values, Configurations]:
         """Values of s, including all stops, and the configurations there [n, dof]. Between neighboring stops,
-        the values are equally spaced, so closely that from each to the next, any point of the arm moves by at
-        most `travel` [m] on average. radii: from `motion_radii`."""
+        the values are equally spaced. Averaged over these steps, no point of the arm moves by more than
+        `travel` [m] in a step. radii: largest `motion_radii` of each joint over all links."""
         parts = []
         for low, high in zip(self.stops[:-1], self.stops[1:], strict=True):
             samples = self.line(np.linspace(low, high, 33), 0)
@@ -335,7 +335,7 @@ class StopGraph:
         s = np.concatenate([*parts, self.stops[-1:]])
         return s, self.line(s, 0)
 
-    def nearest_samples(self, motion: Motion, configurations: Configurations) -> Int[ndarray, "ticks"]:
+    def nearest_samples(self, motion: Motion, configurations: Configurations) -> Int[ndarray, "n"]:
         """For each of the `ticks` + 1 times of a motion, its start and end included, the index of the nearest
         configuration among `configurations`."""
         times, q = motion.rows[:2]

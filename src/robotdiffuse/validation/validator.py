@@ -202,7 +202,8 @@ def first_beyond(
 
 CHORD_SHARE = 0.1
 """Collision is checked on straight lines, and certified clearances are reduced by how far the cubics leave
-these lines. Rows are added until the reduction is at most this fraction of the clearance."""
+these lines. Rows are added until the reduction is at most this fraction of the clearance or, if that is more,
+`tightness` * `contact` / 2 of the settings."""
 CHORD_MARGIN = 0.9
 """Safety factor on the next `chord` to try (the greatest distance between cubics and lines), so that a single
 retry suffices."""

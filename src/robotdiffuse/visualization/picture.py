@@ -244,7 +244,7 @@ def view_of_motion(
     free: tuple[float, float],
     azimuth: float | None = None,
 ) -> Camera:
-    """Of the views from AZIMUTHS x ELEVATIONS, the framed one that shows most of the arm, of its trace along
+    """Of the framed views from AZIMUTHS x ELEVATIONS, the one that shows most of the arm, of its trace along
     a motion and of the obstacles.
 
     `among` are the obstacles. `azimuth` fixes the azimuth, measured from the x axis of the base [rad]; None:

@@ -293,9 +293,10 @@ UNREACHED = StateValidity("no configuration within the joint limits")
 def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | None = None) -> None:
     """Write a problem without a motion as .html or .png.
 
-    The arm is drawn at the start and at the goal; in pictures the arm at the start is see-through, on pages
-    the arm at the goal. Colliding links are red, and goal poses are drawn as axes. Of several goals, the
-    first free one is drawn; if none is free, the first one. Moving obstacles are drawn at their first pose.
+    The arm is drawn at the start and at the goal. One of the two is see-through: in pictures the arm at the
+    start, on pages the arm at the goal. Colliding links are red, and goal poses are drawn as axes. Of
+    several goals, the first free one is drawn; if none is free, the first one. Moving obstacles are drawn at
+    their first pose.
     `result` gives the reason why there is no motion, shown if start and goal are free. Raises InputError for
     a file name with another ending, or a file that cannot be written.
     """

@@ -174,7 +174,7 @@ def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
             close &= close - 1
             if len(scene.may_touch) and scene.may_touch[g, k]:
                 continue
-            d, _ = to_solid(centers, minus(centers, centers), scene.solids[k])
+            d, _ = to_solid(centers, minus(centers, centers), scene.solids[k])  # velocities of 0
             nearer = d < best
             best = minimum(best, d)
             pushed |= nearer

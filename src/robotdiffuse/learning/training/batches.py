@@ -73,8 +73,8 @@ class TrajectoryData:
     digest: str
     """The first 16 digits of the SHA-256 of the shards' fingerprints."""
     validation: int
-    """Number of rows of the validation split in the data of `load_data`. They come last; all other rows are
-    of the training split."""
+    """Number of rows of the validation split. In the data of `load_data` they come last, after those of the
+    training split. The two parts that `split` returns keep the number unchanged."""
 
     def __len__(self) -> int:
         return len(self.q)

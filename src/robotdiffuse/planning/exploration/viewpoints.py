@@ -13,7 +13,7 @@ whole. So small balls cover the arm's surface at the goal. Each ball must be fre
 - a covering sphere of the arm contained it when an image was taken;
 - it is so near the arm at the start of the motion that it counts as free.
 
-The space inside the surface needs no view, since obstacles do not float.
+The space inside the surface needs no view: obstacles do not float, so one inside would cross the surface.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -402,8 +402,8 @@ def best_viewpoints(
     a prediction.
     taken: configurations of earlier images that did not show the wanted voxels. Each of them lowers the score
     of viewpoints nearby.
-    hemmed_in: whether the arm cannot go back far enough along its latest motion. If so, the last path leads
-    to the configuration in which the arm is farthest from the start and from all of `taken`. If even this
+    hemmed_in: whether the arm cannot go back far along its latest motion. If so, the last path leads to the
+    configuration in which the arm is farthest from the start and from all of `taken`. If even this
     configuration is nearer than CONFINED, the path to it also comes first.
     fixed_view: the latest image of a fixed camera. With the arm at a viewpoint, this camera may see wanted
     voxels that the arm hides now.

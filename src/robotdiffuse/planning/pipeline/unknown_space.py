@@ -170,8 +170,11 @@ def plan_with_unknown_space(
 
 
 def policy_for(problem: Problem) -> tuple[str, str]:
-    """The problem's policy for unknown space, or the default; and a note if the arm reaches farther than the
-    network predicts and the policy is predicted, or padded for this reason, otherwise ""."""
+    """The problem's policy for unknown space, or the default; and a note, which may be "".
+
+    If the arm reaches farther than the network predicts, the default is padded, and the note says so; for the
+    policy predicted, the note says that the confidence is limited.
+    """
     if problem.unknown not in (None, PREDICTED):
         return problem.unknown, ""
     from robotdiffuse.learning.completion import REACH, covers
@@ -272,8 +275,8 @@ class _Attempts:
     context: PlanningContext
     unknown: UnknownSpace
     max_confidence: float
-    """Upper limit of the confidence, lowered if a camera seems misplaced: its images may then show occupied
-    space as free."""
+    """Upper limit of the confidence, lowered if a camera seems misplaced, since its images may then show
+    occupied space as free, and if the arm reaches farther than the network predicts."""
 
     def best(self, problem: Problem, assumption: str, end: float) -> PlanResult:
         """A motion that is found before `end` [s since the call], or the result that says why there is none.

@@ -27,8 +27,8 @@ class Packages(NamedTuple):
 
     The folder of a package is looked for in `folders`, then in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, then
     from the URDF's folder upwards: first folders with the package's name, then subfolders with that name.
-    Files that the package's folder lacks are looked for below the URDF's folder and all folders above it,
-    with and without the package's name.
+    A file that the package's folder lacks is looked for in the URDF's folder and in all folders above it, at
+    its path in the package, with and without the package's name in front.
     """
 
     urdf: Path
