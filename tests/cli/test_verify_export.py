@@ -75,7 +75,7 @@ def test_only_valid_motions_are_exported(planned: Path, said: Said) -> None:
     record["problem"] = json.loads((planned / "other.json").read_text())
     Path("bad.json").write_text(json.dumps(record))
     for command in (("export", "bad.json", "--out", "b.yaml"), ("publish", "bad.json", "--to", "localhost")):
-        assert "is not exported: its motion is not valid" in said(2, *command)
+        assert "is refused: its motion is not valid" in said(2, *command)
     assert not Path("b.yaml").exists()
     assert "'70000' is not a port" in said(2, "publish", planned / "r.json", "--to", "host:70000")
     assert run("export", planned / "r.json", "--out", "fine.csv", "--rate", "1000") == 0

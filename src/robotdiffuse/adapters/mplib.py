@@ -99,8 +99,8 @@ class Planner:
         srdf: SRDF with pairs of links that need no check; "" or none: these pairs are found by sampling.
         package_keyword_replacement: The folder that replaces `package://` in the URDF.
         user_link_names: Links that `link_id` counts from 0.
-        user_joint_names: Joints in the order of `qpos`, in which planned joints have the order of the chain;
-            none: all that move, in the order of the URDF; a `qpos` may also hold the planned ones alone.
+        user_joint_names: Joints in the order of `qpos`; the planned ones must have the order of the chain.
+            None: all that move, in the order of the URDF. A `qpos` may also hold the planned ones alone.
         joint_vel_limits: Velocity limits of the planned joints [rad/s]; none: 1, as in MPlib.
         joint_acc_limits: Acceleration limits of the planned joints [rad/s²]; none: those of the robot (MPlib:
             1).
@@ -111,8 +111,8 @@ class Planner:
 
     Raises:
         InputError: For files that cannot be read, a package folder that does not exist, an unknown
-            `move_group`, unknown joints, `user_joint_names` that lacks a planned joint, repeats or reorders
-            them, limits that are not a positive number for each planned joint, and `objects` that are not
+            `move_group`, unknown joints, `user_joint_names` that do not name each planned joint once and in
+            order, limits that are not a positive number for each planned joint, and `objects` that are not
             empty. Names in `user_link_names` are checked when an object is held.
     """
 

@@ -371,7 +371,7 @@ ROBOTS = (
                         "URDF of an arm, MuJoCo model, or xacro file; compiling xacro runs the code in it",
                     ),
                     ("--name NAME", "name that problems use (default: the URDF's)"),
-                    ("--out FOLDER", "folder to write (default: one in the user's robots)"),
+                    ("--out FOLDER", "folder to write (default: one in the user's folder of robots)"),
                     (
                         "--group NAME",
                         "group of the SRDF, or arm, to plan for; the words both and all stand for several "

@@ -114,7 +114,7 @@ def _read(
     if arguments.topic is not None and ending in NO_TOPICS:
         raise InputError(f"--topic is for bags and MCAP files; {arguments.motion} has no topics")
     if arguments.index and arguments.problem is None:
-        raise InputError("--index says which problem of --problem FILE; give --problem, or leave it out")
+        raise InputError("--index says which problem of --problem FILE; give --problem too, or no --index")
     only_motion = arguments.problem is None and arguments.scene is None
     if only_motion and ending == ".json":
         result, problem = read_solved(arguments.motion)
@@ -201,7 +201,7 @@ def validated_motion(file: str, rate: float | None = None) -> tuple[Problem, Tra
     violation = verify_trajectory(problem, trajectory).violation
     if violation is not None:
         rows = "" if rate is None else f" with rows at {rate:g} Hz"
-        raise InputError(f"{file} is not exported: its motion{rows} is not valid: {violation.message}")
+        raise InputError(f"{file} is refused: its motion{rows} is not valid: {violation.message}")
     return problem, trajectory
 
 

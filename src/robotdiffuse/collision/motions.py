@@ -97,7 +97,7 @@ def largest_motion_radii(robot: Robot) -> JointValues:
 
 
 class Contact(NamedTuple):
-    """The first contact of a motion."""
+    """A contact of a motion."""
 
     check: Check
     other: str

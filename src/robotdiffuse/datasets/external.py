@@ -93,8 +93,8 @@ def write_dataset(
     Raises:
         InputError: If there are no paths, if a list of scenes does not have one for each path, and if no
             scene falls into the training split; for joint values of the wrong shape or out of limits,
-            obstacles that are no spheres or boxes, allowed contacts, a robot that is not as loaded, fewer
-            than 2 waypoints, and a folder that holds data.
+            obstacles that are no spheres or boxes, allowed contacts, a robot that was changed after loading,
+            fewer than 2 waypoints, and a folder that holds data.
 
     Examples:
         >>> start, goal = [0, -0.8, 0, -2.4, 0, 1.6, 0.8], [0.5, -0.2, 0, -2, 0, 1.8, 0.8]

@@ -185,7 +185,9 @@ _READERS: dict[str, Callable[[Path], ndarray]] = {
 
 
 def read_views(entries: object, folder: Path) -> tuple[tuple[DepthView, ...], tuple[str, ...]]:
-    """The views of a problem file, and notes on removed points. File names are relative to `folder`.
+    """The views of a problem file, and notes on removed points and on ignored distortion and scales.
+
+    File names are relative to `folder`.
 
     Raises InputError for unknown and missing fields, values of the wrong type and files that cannot be read;
     the message starts with the place in the file, e.g. views[1].

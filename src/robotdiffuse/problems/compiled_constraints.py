@@ -295,7 +295,7 @@ def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
             limit = min(spread + line.angle, np.pi)
             rows.append(_Row(CONE, limit, line.angle, a=T_start[:3, :3].T @ link_axis, b=direction))
     else:
-        # its product with a position relative to the start is the fraction of the line
+        # gradient · (position - start) is the fraction of the line that is behind the position
         gradient = displacement / length**2 if length > 0 else displacement
         rows.append(_Row(TURN, line.angle, line.angle, T_start, a=turn, b=gradient))
     return rows
@@ -358,7 +358,7 @@ def _pose_rows(pose: PoseGoal, position: float, angle: float) -> list[_Row]:
         if kind == ROLL_PITCH_YAW:
             half = np.where(half >= (1 - GOAL_MARGIN) * np.pi, np.inf, half)
             if not half.any():
-                kind = TURN  # by 0: to the orientation of the pose
+                kind = TURN  # with a = 0: the desired orientation is that of the pose
         rows.append(_Row(kind, limit, limit, T, half, INNER_GOAL_FRACTION * half))
     return rows
 

@@ -218,7 +218,7 @@ def equipped(robot: Robot, values: JsonObject, folder: Path, notes: list[str]) -
             attached_shape = read_shape(location, shape, folder, notes)
             touch = _touch_links(location, entry)
             robot = robot.attach(attached_shape, _text(f"{location}.link", entry["link"]), touch)
-    # its link, or one that it may touch, may be a held object
+    # the tool waited for its links, which may be held objects
     return robot if waiting is None else robot.with_tool(*waiting)
 
 
@@ -482,7 +482,7 @@ FIELDS = {
     ),
     "unknown": Field({"enum": list(UNKNOWN_POLICIES)}),
 }
-"""Fields of `Problem`, in the order in which files list them."""
+"""Fields of `Problem`, and the allowed contacts of its scene, in the order in which files list them."""
 SETUP: dict[str, Schema] = {
     "robot": TEXT | {"description": f"a URDF file, an added robot, or {', '.join(ROBOTS)}"},
     "locked": OBJECT | {"additionalProperties": NUMBER},

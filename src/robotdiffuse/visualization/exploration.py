@@ -290,8 +290,8 @@ def write_exploration(explorer: RecordedExplorer, scene: Scene, file: str | File
 
 def _page_time(time: float, index: int) -> float:
     """The time on the page of a `time` during the motion of the step with this index [s]. On the page, a
-    pause comes before each motion. With the index of the step before, the beginning of a step becomes the
-    beginning of its pause."""
+    pause comes before each motion. The pause of step i begins at `_page_time(begins, i - 1)`, where `begins`
+    is the time at which the step begins."""
     return round(time + READING_TIME * (index + 1), 4)
 
 

@@ -109,10 +109,10 @@ class Round(NamedTuple):
 
 @inner_kernel()
 def _spread(motion, start, stop, spread):
-    """Writes q, dq, e and D (`max_offset`), as defined at the top of this file, for the piece from start to
-    stop to the first rows of spread[5, dof]; the last row is scratch memory."""
+    """Writes q, dq, e and D (`max_offset`) of the piece from start to stop, as defined at the top of this
+    file, into the first rows of spread[5, dof]; the last row is scratch memory."""
     q, dq, e, max_offset, scratch = spread
-    # from the ends of the piece (the start in `dq`, the end in `scratch`), then from the waypoints between
+    # first the ends of the piece (the start is in `dq`, the end in `scratch`), then the waypoints between
     dof = len(q)
     configuration(motion, 0.5 * (start + stop), q)
     configuration(motion, start, dq)

@@ -105,7 +105,7 @@ class EncoderTraining(TrainingSettings):
     average: ShareBelowOne = 0.999
     checkpoint_seconds: NotNegative = 60.0
     scenes: Annotated[str, OneOf(("mixed", "rop"))] = "mixed"
-    """Training scenes: mixed, of every kind, or rop, two large obstacles each as in the paper's data."""
+    """Training scenes. mixed: of every kind; rop: with two large obstacles each, as in the paper's data."""
     max_obstacles: Natural = 12
     """Largest number of obstacles in a mixed training scene."""
     points: Count = 256

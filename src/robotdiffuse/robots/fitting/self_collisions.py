@@ -58,7 +58,7 @@ class Links:
         self.robot = robot
         names = {joint.name for joint in robot.joints}
         movable = [joint for joint in robot.joints if joint.movable]
-        # a joint that mimics one above the base moves by itself
+        # a joint that mimics one outside of the robot moves by itself
         self.joints = [j for j in movable if j.mimic is None or j.mimic.joint not in names]
         self.lower = np.array([joint.lower for joint in self.joints])
         self.upper = np.array([joint.upper for joint in self.joints])
@@ -253,7 +253,7 @@ MAX_LOCKED_JOINTS = 1
 """A link, such as the bellows of a lift, belongs to the arm if at most this many locked joints connect it to
 the arm. Links after more locked joints belong to a head or another arm."""
 MAX_DEFAULT_JOINTS = 3
-"""Pairs of links with more joints between them are not allowed for the reason `default`: limits of single
+"""The reason `default` does not apply to pairs of links with more joints between them: limits of single
 joints keep neighbors apart, but not a hand from its own shoulder."""
 MAX_POSE_OVERLAP = 0.03
 """If links overlap in a named pose by less than this [m], the pair is allowed for the reason `pose`."""
