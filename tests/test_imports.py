@@ -162,7 +162,7 @@ def test_import_loads_nothing_heavy_and_public_names_resolve() -> None:
     assert python(code).stdout == "[]\nTrue True\n"
 
 
-def test_a_misspelt_name_is_answered_with_a_similar_one_and_commands_need_no_docstrings() -> None:
+def test_a_misspelled_name_is_answered_with_a_similar_one_and_commands_need_no_docstrings() -> None:
     ended = python("import robotdiffuse as rd; rd.load_problems", status=1)
     assert "no attribute 'load_problems'. Did you mean: 'load_problem'?" in ended.stderr
     # Regression: with PYTHONOPTIMIZE=2, which leaves out docstrings, every command was a KeyError

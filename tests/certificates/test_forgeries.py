@@ -192,6 +192,7 @@ FORGED: dict[str, tuple[Callable[[Record], object], str]] = {
         lambda record: record["moving"][0]["stop"].__setitem__(-1, record["moving"][0]["stop"][-1] - 0.5),
         "proof: .*ball is missing from row",
     ),
+    "no proof": (set_to("proof", to=None), "proof is None; it takes list"),
     "nothing about what moves": (set_to("moving", to=None), "the part on moving obstacles is missing"),
     # tolerances
     "a missing tolerance": (lambda record: record["tolerances"].pop("chord"), "tolerances has no chord"),

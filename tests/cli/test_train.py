@@ -45,7 +45,11 @@ def test_parts_replace_those_of_the_config(trained: list[PlannerTraining]) -> No
     assert run(*TRAIN, "--config", "paper", "--denoiser", "unet", *parts, "--target", "residual", "--device", "cpu") == 0
     assert run(*TRAIN, "--config", "paper") == 0
     assert run(*TRAIN, "--config", "table2_unet", "--denoiser", "decoder_only") == 0
-    changed, paper, row = trained
+    # regression: values that the config has already turned its progressive training off
+    assert run(*TRAIN, "--config", "paper", "--waypoints", "254", "--objective", "clean") == 0
+    assert run(*TRAIN, "--target", "limits") == 0
+    changed, paper, row, same, limits = trained
+    assert same == paper and not limits.smooth_noise
     wanted = {"denoiser": "unet", "denoiser_settings": PAPER_SIZES["unet"], "objective": "noise", "sampler": "ddim"}
     wanted |= {"target": "residual", "waypoints": 64, "progressive": False, "condition_drop": 0.2, "device": "cpu"}
     assert changed == replace(paper, **wanted)
@@ -70,6 +74,7 @@ def test_the_encoder_of_the_config_is_that_of_an_arm_too(config: str, encoder: s
     monkeypatch.setattr("robotdiffuse.cli.train.generate", lambda *_, **__: None)
     assert run("train", "planner", "--robot", "panda", "--out", "o", "--config", config) == 0
     assert trained[0].encoder == encoder and not Path("o", "encoder").exists()
+    assert trained[0].minutes == CONFIGS[config].changes.get("minutes"), "regression: all had 2.4 million samples"
 
 
 SMALL = TransformerSettings(width=16, layers=1, heads=2, hidden=24, patch=8)

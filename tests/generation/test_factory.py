@@ -55,7 +55,9 @@ def test_a_folder_called_like_a_robot_does_not_hide_it_from_nodes(tmp_path, monk
     """Regression: if the working folder contained a folder with the robot's name, nodes got its path instead of the robot."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "panda").mkdir()
-    assert not names_a_file("panda") and names_a_file("./panda") and rd.load_robot("panda") is PANDA
+    assert (
+        not names_a_file("panda") and names_a_file("./panda") and names_a_file("ARM.URDF") and rd.load_robot("panda") is PANDA
+    )
 
 
 @pytest.fixture(scope="module")

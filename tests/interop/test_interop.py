@@ -104,6 +104,9 @@ def test_mcap_holds_scene_urdf_frames_and_joint_states(planned: Planned, tmp_pat
     write_motion(replace(problem, T_world_base=transform(np.array([1.0, 2.0, 3.0]))), trajectory, tmp_path / "m.mcap")
     again = ros2.problem_in(tmp_path / "m.mcap")
     assert again is not None and rd.verify(again, trajectory).valid
+    # regression: each joint had another one's value
+    turned = replace(trajectory, joint_names=trajectory.joint_names[::-1])
+    refuses("trajectory.joint_names is", write_motion, problem, turned, tmp_path / "m.mcap")
 
 
 def test_a_urdf_goes_along(tmp_path: Path) -> None:

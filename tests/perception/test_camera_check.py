@@ -18,7 +18,7 @@ from robotdiffuse.core.transforms import placed, pose, quaternion_from_rotation,
 from robotdiffuse.perception.camera_check import OPTICAL, agreement, camera_note
 from robotdiffuse.perception.depth_filter import pose_error
 from robotdiffuse.perception.depth_view import DepthNoise
-from robotdiffuse.perception.pose_refinement import PoseRefinement
+from robotdiffuse.perception.pose_refinement import PoseRefinement, mounted
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, render_depth
 from robotdiffuse.perception.visibility import surface_balls
 from robotdiffuse.planning.exploration.simulated import measured, taken, wrist_camera
@@ -198,6 +198,17 @@ def test_errors_of_poses_are_found_again(seed: int) -> None:
     assert error.max() < 0.005 and stated.max() < 0.012, "of the camera on the arm"
     error, now = displaced(poses.refined(misplaced(standing, 10 + seed)), standing)
     assert (error < now).all() and now.max() < 1.05 * displaced(first, standing)[1].max()
+
+
+def test_a_deviation_of_the_position_alone_is_refined_and_near_cameras_are_told_apart() -> None:
+    """Regressions: with an angle of 0 nothing was refined; cameras 8 cm apart on the arm were taken for one."""
+    standing = seen_beside(HOME)
+    moved = replace(standing, T_base_camera=transform(np.array([0.008, -0.006, 0.004])) @ standing.T_base_camera)
+    found = PoseRefinement(PANDA, rd.Scene([FLOOR]), []).observe(replace(moved, pose_deviation=(0.02, 0.0)))
+    assert found.pose_deviation[0] < 0.017 and displaced(found, standing)[0].max() < 0.008
+    beside = CAMERA.T_link_camera @ transform(np.array([-0.08, 0.0, 0.0]))
+    mounts = [(CAMERA.link, CAMERA.T_link_camera), (CAMERA.link, beside)]
+    assert mounted(PANDA, mounts, PANDA.fk(HOME, CAMERA.link) @ beside, HOME) == 1
 
 
 def test_views_that_state_no_error_stay_as_they_are() -> None:

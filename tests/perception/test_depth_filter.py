@@ -50,6 +50,8 @@ def test_noise_is_measured_on_images_of_a_still_scene() -> None:
     stated = replace(noise.applied(view, np.random.default_rng(9)), noise=found)
     assert filtered(stated).spread == pytest.approx(filtered(replace(stated, noise=None)).spread, rel=0.5)
     refuses("at least two", rd.measure_noise, images[:1])
+    noisy = [1 + 0.3 * np.random.default_rng(k).standard_normal((48, 64)) for k in range(5)]
+    refuses("images: depth_noise.spread is 0.3", rd.measure_noise, noisy)
     refuses("images are .*a single number", unwrap(rd.measure_noise), np.array(1.0))
     refuses("images are .'not numbers'", unwrap(rd.measure_noise), ["a", "b"])
     refuses("images have depths about .*; they must be in meters", rd.measure_noise, [1000 * image for image in images])

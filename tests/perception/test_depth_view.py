@@ -161,8 +161,10 @@ def test_intrinsics_beside_an_image(name: str, content: Any, tmp_path: Path, mon
     if name.startswith("camera"):
         entry["intrinsics"] = name
     monkeypatch.chdir(tmp_path.parent)
+    before = dict(entry)
     for folder in (tmp_path, Path(tmp_path.name)):
         assert read_views([entry], folder)[0][0].intrinsics == K
+    assert entry == before, "regression: the name of the file was written into it"
 
 
 @pytest.mark.parametrize(

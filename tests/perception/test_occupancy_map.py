@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from inspect import unwrap
 
 import numpy as np
 import pytest
@@ -127,5 +128,7 @@ def test_points_and_free_zones() -> None:
     assert known.free.sum() == 30 * 30 * 35
     known.add_points(np.array([[0.01, 0.01, 0.01], [9.0, 0.0, 0.0]]))
     assert known.occupied.sum() == 1 and known.free.sum() == 30 * 30 * 35 - 1
+    for stamp in (None, "a", np.nan):  # regressions: a raw TypeError, and points that max_age lost
+        refuses("stamp is", unwrap(OccupancyMap.add_points), known, np.zeros((1, 3)), stamp)
     refuses("free_zone is", known.declare_free, ((0.3, 0.0, 0.0), (0.1, 1.0, 1.0)))
     refuses(r"view\.configuration is None; a map needs", known.add, replace(view_from(0.0), configuration=None))

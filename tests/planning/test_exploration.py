@@ -139,19 +139,22 @@ def test_looks_see_what_is_wanted() -> None:
     target = (np.array([77.5, 57.5, 42.5]) * MAP.edge) + MAP.low
     scene = rd.Scene([FLOOR])
     tree = ReachableTree(PANDA, scene, HOME)
-    best = list(islice(best_viewpoints(one.map, tree, camera, wanted, None, np.random.default_rng(0)), 3))
+    best = list(islice(best_viewpoints(one.map, tree, [camera], wanted, None, np.random.default_rng(0)), 3))
     assert len(best) == 3
     for way in best:
         assert np.array_equal(way[0], HOME)
         assert rd.verify(rd.Problem(PANDA, scene, HOME, way[-1]), rd.Path(PANDA.joint_names, way)).valid
-    for T in camera.poses(PANDA, np.stack([way[-1] for way in best])):
+    # regression: the first of several cameras decided, even one that looks backwards
+    away = replace(camera, T_link_camera=camera.T_link_camera @ rd.pose([0, 0, 0], rpy=[np.pi, 0, 0]))
+    both = next(best_viewpoints(one.map, tree, [away, camera], wanted, None, np.random.default_rng(0)))
+    for T in camera.poses(PANDA, np.stack([way[-1] for way in (*best, both)])):
         x, y, z = T[:3, :3].T @ (target - T[:3, 3])
         fx, fy, cx, cy = camera.intrinsics
         assert z > 0 and 0 <= fx * x / z + cx <= camera.size[0] and 0 <= fy * y / z + cy <= camera.size[1]
     goal_seen = GoalSeen(PANDA, one.map, ViewMemory(PANDA), False)
     goal_seen.observe(rd.DepthView(np.zeros((2, 2)), (1.0, 1.0, 0.5, 0.5), np.eye(4), best[0][-1]))
     [taken] = goal_seen.taken
-    other = next(best_viewpoints(one.map, tree, camera, wanted, None, np.random.default_rng(0), [taken]))
+    other = next(best_viewpoints(one.map, tree, [camera], wanted, None, np.random.default_rng(0), [taken]))
     assert np.abs(other[-1] - taken).max() > 0.05, "not from where an image did not show it"
 
 
@@ -488,6 +491,9 @@ def test_it_looks_from_where_nothing_is_in_the_way(problem: rd.Problem, result: 
     found = rd.next_view(problem, result, [BEYOND, ABOVE])
     assert np.array_equal(found.T_base_camera, ABOVE) and 0.2 < found.seen <= 1
     assert rd.next_view(problem, result, [BEYOND]).seen < 0.1
+    # regression: known shapes hid nothing
+    lid = rd.Box([0.3, 0.0, 1.1], [1.5, 1.5, 0.02])
+    assert rd.next_view(replace(problem, scene=rd.Scene([lid])), result, [ABOVE]).seen < 0.05
     assert rd.next_view(problem, result).seen >= max(rd.next_view(problem, result, [T]).seen for T in poses_around()[::7])
     above = ray_cast(SCREEN, ABOVE, INTRINSICS, (160, 120), PANDA, START)
     assert rd.next_view(replace(problem, scene=rd.Scene(), views=(*problem.views, above)), result, [ABOVE]).seen < found.seen

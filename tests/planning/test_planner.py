@@ -311,7 +311,7 @@ def test_a_process_that_dies_costs_one_problem(monkeypatch: pytest.MonkeyPatch) 
     results = list(rd.plan_many(asked, "deadly", workers=1, time_limit=300.0))
     ends = [result.status for result in results]
     assert ends == [rd.Status.SOLVED, rd.Status.ERROR, rd.Status.SOLVED, rd.Status.ERROR, rd.Status.SOLVED]
-    assert "died" in results[1].reason and "no such robot" in results[3].reason
+    assert results[1].problem is asked[1] and "died" in results[1].reason and "no such robot" in results[3].reason
 
 
 def test_arguments_are_checked_at_once() -> None:

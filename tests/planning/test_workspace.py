@@ -1,5 +1,7 @@
 """A workspace: obstacles that are added, moved and removed, held objects, lines, a moved base, lists of steps."""
 
+import pickle
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -285,6 +287,10 @@ def test_motions_with_other_payloads_or_moving_obstacles_or_from_a_velocity_are_
         refuses("another robot, scene or payload", rd.join, [there, other])
     refuses(r"results\[1\] has a start_velocity", rd.join, [there, planned(end, "ready", start_velocity=[0.1] * 7)])
     assert rd.join([loaded, back]).problem.payload is not None
+    cone = [rd.AxisCone("panda_hand", [0, 0, 1], [0, 0, -1], 3.0) for _ in range(2)]
+    ways = [planned("ready", end, constraints=cone[:1]), planned(end, "ready", constraints=cone[1:])]
+    equal = replace(ways[1], problem=replace(ways[1].problem, scene=rd.Scene()))
+    assert len(rd.join([pickle.loads(pickle.dumps(ways[0])), equal]).problem.constraints) == 1, "equal, not the same"
 
 
 def test_a_base_that_is_moved_leaves_obstacles_in_the_world() -> None:

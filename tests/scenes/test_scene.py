@@ -159,6 +159,14 @@ def test_a_name_given_twice_stands_for_both() -> None:
     assert contact_notes(rd.Scene([BALL], {"ball": "all"})) == ("contact of ball with all links is allowed",)
 
 
+def test_a_ball_on_a_track_can_be_moved_by_a_turn() -> None:
+    """Regression: a sphere's frame does not turn, but the poses of its track did, which was refused."""
+    poses = [rd.pose([0.5, 0, 1.6]), rd.pose([0.5, 0, 1.3])]
+    ball = rd.MovingObstacle(rd.Sphere([0.5, 0, 1.6], 0.05), times=[1, 2], poses=poses)
+    T = rd.pose([1, 0, 0], rpy=[0.3, 0, 1])
+    np.testing.assert_allclose(ball.moved(T).pose(1.5)[:3, 3], (T @ [0.5, 0, 1.45, 1])[:3])
+
+
 def test_moved_attached_and_detached_scenes_keep_what_remains() -> None:
     scene = rd.Scene([BALL, WALL], {"ball": ["l3"], "wall": "all"})
     assert scene.moved(np.eye(4)).allowed_contacts == scene.allowed_contacts

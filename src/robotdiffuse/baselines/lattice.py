@@ -100,7 +100,7 @@ def _distance(s, u, v):
 def _update_vertex(s, v):
     """UpdateVertex of D* Lite: sets the key of a node in the queue. The heuristic is the larger of two lower
     bounds on the cost to the start: the Euclidean distance, and the summed joint differences divided by
-    sqrt(k). Moves of the most joints, k, are the cheapest way to cover this sum: k for a cost of sqrt(k)."""
+    sqrt(k), where k is the most joints that a move has. Such a move covers k of this sum for sqrt(k)."""
     node = s.nodes[v]
     queue = s.queue
     i = len(queue) // 2 + v
@@ -322,8 +322,7 @@ class LatticeSearch:
                 return outcome
 
     def path(self) -> Configurations | None:
-        """The start, the nodes at which the path that `run` found turns, and the goal; None if it found
-        none."""
+        """The path that `run` found: start, nodes where it turns, and goal; None without a path."""
         s = self._search
         if self.cost == np.inf:
             return None

@@ -219,7 +219,7 @@ FIELDS = {
     "problem": _typed(dict | None),
     "motion": Field(_motion, _motion_record),
     "between": NUMBERS,
-    "proof": Field(_proof, _proof_record),
+    "proof": Field(lambda name, value: _proof(name, converted(name, list, value)), _proof_record),
     "request_parts": HASHES,
     "moving": Field(_proof, _proof_record),
     "constraints": Field(_named_bounds),

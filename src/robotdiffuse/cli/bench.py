@@ -90,10 +90,14 @@ def _write_replays(motions: list[Replay], file: Path) -> None:
     robot = motions[0].case.problem.robot
     entries = [
         GalleryEntry(
-            motion.title, motion.caption, problem.scene, Waypoints(robot.joint_names, motion.positions)
+            motion.title,
+            motion.caption,
+            problem.scene,
+            Waypoints(robot.joint_names, motion.positions),
+            problem.moving,
         )
         for motion in motions
-        if (problem := motion.case.problem).robot.name == robot.name
+        if (problem := motion.case.problem).robot == robot
     ]
     write_gallery(robot, entries, file, "Motions")
 

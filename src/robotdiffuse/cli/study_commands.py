@@ -210,7 +210,7 @@ TRAIN = Command(
                 ("--workers N", "processes that generate data, without --data (default: all cores)", count),
                 (
                     "--out FOLDER",
-                    f"{OUT[1]}; without --data also for the data (default: beside the user's robots)",
+                    f"{OUT[1]}; without --data also for the data (default: beside the robot's weights)",
                 ),
                 *TRAINING,
                 DEVICE,

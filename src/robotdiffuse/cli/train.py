@@ -59,6 +59,9 @@ def run_planner(arguments: Namespace) -> None:
         raise InputError(f"unknown config {shown(arguments.config)}; known:", descriptions)
     options = chosen(arguments, PlannerTraining.__dataclass_fields__)
     config = CONFIGS[arguments.config].changes
+    for name in ("denoiser", "objective", "waypoints"):
+        if options.get(name) == config.get(name, getattr(PlannerTraining, name)):
+            options.pop(name, None)  # what the config has already
     if "denoiser" in options and config.get("denoiser_settings") is not None:
         # these settings are for the config's own denoiser; another gets its PAPER_SIZES, or its defaults
         options["denoiser_settings"] = PAPER_SIZES.get(arguments.denoiser) or DENOISERS.defaults(
@@ -67,6 +70,8 @@ def run_planner(arguments: Namespace) -> None:
     if {"denoiser", "objective", "waypoints"} & set(options):
         # the stages of progressive training suit the config's own denoiser, objective and waypoints
         options["progressive"] = False
+    if options.get("target") == "limits":
+        options["smooth_noise"] = False  # that target takes white noise only
     if "encoder" in config:
         options.setdefault("encoder", config["encoder"])
     if arguments.config == "paper" and "encoder" not in options:
@@ -139,8 +144,6 @@ def _print_report(figures: dict[str, float], out: str) -> None:
 MOTIONS = 60_000
 """Number of motions to generate: about twenty minutes on two cores. With rotated copies they are 360,000, and
 the training sees each seven times."""
-SAMPLES = 2_400_000
-"""Number of training samples, as for the bundled Panda weights: one to two hours on one core."""
 MIX = {"rop": 0.2, "rop_dense": 0.3, "shelf": 0.2, "crate": 0.15, "table": 0.15}
 """Fractions of the problem families. They contain more furniture than the data of the Panda's weights, since
 a network helps most there."""
@@ -183,8 +186,8 @@ def train_for_robot(
     folder.
 
     source: the robot, as for `load_robot`. options: training settings from the command line, which change
-    those of `config`. out: working folder; None: beside the user's robots. motions: number of motions to
-    generate; workers: number of processes that generate them.
+    those of `config`. out: working folder; None: `training`, beside the robot's weights. motions:
+    number of motions to generate; workers: number of processes that generate them.
 
     Raises InputError for an unknown robot, a missing device or encoder, a folder that was made with other
     settings, and too little disk space.
@@ -198,8 +201,6 @@ def train_for_robot(
     data = data_settings(source, robot, motions, options.get("seed"))
     _check_disk(work, data.trajectories)
     defaults: dict[str, Any] = {"encoder": str(work / "encoder")}
-    if options.get("minutes") is None:
-        defaults["samples"] = SAMPLES
     settings: PlannerTraining = planner_training(
         config, defaults | options | {"data": str(work / "data"), "robot": source}
     )

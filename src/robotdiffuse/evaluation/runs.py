@@ -122,7 +122,7 @@ def gather_cases(names: list[str], count: int | None, out: FilePath, report: Pro
     repeated_names = repeated(problem_set_name(text) for text in names)
     if repeated_names:
         twice = ", ".join(sorted(repeated_names))
-        raise InputError(f"problems has {twice} twice; leave one out, or rename its file or folder")
+        raise InputError(f"problems have {twice} twice; leave one out, or rename its file or folder")
     return [case for text in names for case in _set(text, count, out / "problems", report)]
 
 

@@ -68,13 +68,15 @@ def write_motion(problem: "Problem", trajectory: Trajectory, file: str | Path) -
     """Write a motion and its problem in the format of the file's ending, one of WRITERS or
     TRAJECTORY_ENDINGS.
 
-    Raises InputError for arguments of another type, for rows less than 1 ns apart in the formats of ROS, and
-    as `check_export` does.
+    Raises InputError for arguments of another type, for joints that are not those of the problem, for
+    rows less than 1 ns apart in the formats of ROS, and as `check_export` does.
     """
     from robotdiffuse.problems.problem import check_problem
+    from robotdiffuse.robots.robot import check_joints
 
     check_problem(problem)
     check_type("trajectory", trajectory, Trajectory, "a Trajectory, such as rd.plan(problem).trajectory")
+    check_joints("trajectory", trajectory.joint_names, problem.robot)
     path = check_export(file)
     if path.suffix.lower() in TRAJECTORY_ENDINGS:
         trajectory.save(path)
@@ -85,8 +87,8 @@ def write_motion(problem: "Problem", trajectory: Trajectory, file: str | Path) -
 def read_motion(file: str | Path, topic: str | None = None) -> "RecordedMotion":
     """Read a motion from a file of any program; a folder is read as a ROS 2 bag.
 
-    Raises InputError for an ending that is not in READERS, a file that is missing, damaged or holds no motion
-    or several, a topic that holds no motion, and a package that is not installed.
+    Raises InputError for an ending that is not in READERS, a file that is missing or damaged, or holds
+    no motion or several, a topic that holds no motion, and a package that is not installed.
     """
     path = file_name(file)
     ending = BAG if path.is_dir() else path.suffix.lower()

@@ -16,9 +16,9 @@ of CHOMP does (Zucker et al., IJRR 2013). The cost of length is CHOMP's smoothne
 step moves each waypoint towards the middle of its two neighbors.
 
 A problem's path constraints are one more cost: the sum of h^2 / 2 over their rows (scalar constraints) that
-exceed their limits, which are lowered by (1 - `tolerance_share`) times the tolerance. h [m] is the difference
-to the value within the limit that projection aims for (`projection_kernel`). A radian counts as
-`projection_kernel.ANGLE_WEIGHT` meters.
+exceed their limits, which are lowered by (1 - `tolerance_share`) times the tolerance. Here h [m] is how far
+a row's value is from the value that projection aims for, which is within the limit (`projection_kernel`). A
+radian counts as `projection_kernel.ANGLE_WEIGHT` meters.
 """
 
 from dataclasses import dataclass

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int32
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.errors import InputError, form, numbers, shown
+from robotdiffuse.core.errors import InputError, form, located, numbers, shown
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Points, Spheres, Values, for_kernels
 from robotdiffuse.perception.depth_view import (
@@ -372,7 +372,8 @@ def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
     spread, neighbor_correlation = max((over_time, float(correlated)), *still)
     length = correlation_length(neighbor_correlation)
     missing = 1 - seen.sum() / max(len(stack) * int((seen.sum(axis=0) > 0).sum()), 1)
-    return DepthNoise(spread=spread, missing=float(missing), correlation=length)
+    with located("images"):
+        return DepthNoise(spread=spread, missing=float(missing), correlation=length)
 
 
 def pose_error(view: DepthView, distance: ArrayLike) -> Values:

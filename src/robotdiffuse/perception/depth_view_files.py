@@ -234,7 +234,7 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
         name = Path(values["depth"])
         candidates = (name.with_suffix(suffix) for suffix in INTRINSICS_FORMATS)
         existing = (str(path) for path in candidates if path != name and (folder / path).is_file())
-        values.setdefault("intrinsics", next(existing, None))
+        values = {"intrinsics": next(existing, None), **values}
         source = {"depth": str(Path(file).absolute())} | ({} if scale is None else {"scale": scale})
     elif scale is not None:
         raise InputError(

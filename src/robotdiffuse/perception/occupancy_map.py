@@ -19,6 +19,7 @@ from robotdiffuse.collision.kernel_arrays import reach_bound
 from robotdiffuse.core import errors
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.locked import locked
+from robotdiffuse.core.settings import Number, converted
 from robotdiffuse.core.types import Configuration, Path, Points, Values, frozen_dataclass
 from robotdiffuse.perception.depth_filter import PointErrors, filtered, point_errors, wide_regions
 from robotdiffuse.perception.depth_view import AssumedPoints, DepthView
@@ -362,6 +363,7 @@ class OccupancyMap:
         `rd.PointCloud.from_file`. They give no information about free space. Raises InputError for anything
         but n x 3 numbers."""
         at = MAP.indices(errors.points("map", "points", points))
+        stamp = converted("stamp", Number, stamp)
         at = at[MAP.contains(at)]
         if stamp < self.oldest:  # already forgotten
             return

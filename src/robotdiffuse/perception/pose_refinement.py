@@ -216,6 +216,8 @@ FAR = 0.2
 """Surfaces farther from a point than this are not matched with it [m]."""
 OTHERS = 8
 """Number of nearest points among which a point of another image is searched for."""
+LEAST_STATED = 1e-5
+"""A stated deviation of 0 counts as this: [m] or [rad]."""
 PRIOR_DEVIATIONS = 1.5
 """Number of standard deviations in the `pose_deviation` that users state."""
 DEVIATIONS = 2.5
@@ -321,7 +323,7 @@ class PoseRefinement:
             return view
         camera = self._cameras[number]
         sizes = np.linalg.norm(camera.error.reshape(2, 3), axis=1)
-        if (sizes > IMPLAUSIBLE * np.array(view.pose_deviation)).any():
+        if (sizes > IMPLAUSIBLE * np.maximum(view.pose_deviation, LEAST_STATED)).any():
             return view
         T = view.T_base_camera @ _pose(camera.error)
         return replace(view, T_base_camera=T, pose_deviation=_deviation(view, T, camera.covariance))
@@ -333,15 +335,14 @@ class PoseRefinement:
         if not any(view.pose_deviation) or view.cloud is not None or q is None:
             return None
         T = view.T_base_camera
+        mount = mounted(self._robot, self._on_arm, T, q)
+        link, nominal = (None, T) if mount is None else self._on_arm[mount]
         for number, camera in enumerate(self._cameras):
-            if camera.link is None and np.allclose(T, camera.T):
-                return number
-            if camera.link is not None and is_on(self._robot, camera.link, camera.T, T, q):
+            if camera.link == link and np.allclose(nominal, camera.T):
                 return number
         if len(self._cameras) == MAX_CAMERAS:
             return None
-        stated = np.repeat(np.maximum(view.pose_deviation, 1e-5), 3) / PRIOR_DEVIATIONS
-        link, nominal = next((mount for mount in self._on_arm if is_on(self._robot, *mount, T, q)), (None, T))
+        stated = np.repeat(np.maximum(view.pose_deviation, LEAST_STATED), 3) / PRIOR_DEVIATIONS
         camera = _Camera(link, nominal, stated, np.zeros(6), np.diag(stated**2))
         self._cameras.append(camera)
         return len(self._cameras) - 1
@@ -455,9 +456,11 @@ class PoseRefinement:
             yield _selected(matched, (n * normals[mine][ok]).sum(axis=1) > ALIKE)
 
 
-def is_on(robot: Robot, link: str, nominal: Pose, T: Pose, q: Configuration) -> bool:
-    """Whether a camera at T = T_base_camera is the camera on `link` with T_link_camera = `nominal`."""
-    return bool(np.abs(T - robot.fk(q, link) @ nominal).max() < SAME_CAMERA)
+def mounted(robot: Robot, on_arm: Sequence[tuple[str, Pose]], T: Pose, q: Configuration) -> int | None:
+    """The index of the camera on the arm (link and T_link_camera) that is nearest to T = T_base_camera; None
+    if it differs by SAME_CAMERA or more."""
+    off = [float(np.abs(T - robot.fk(q, link) @ nominal).max()) for link, nominal in on_arm]
+    return int(np.argmin(off)) if min(off, default=SAME_CAMERA) < SAME_CAMERA else None
 
 
 def _selected(match: _Match, ok: Mask) -> _Match:

@@ -218,15 +218,16 @@ def plan(
         seed: Seed of all random numbers, at least 0. The same seed gives the same path, unless time runs out.
         until: "first": return the first verified motion. "converged": improve the motion until more time
             hardly improves it. "time_limit": improve it until time runs out. Planners other than aorrtc,
-            rrt_connect and robotdiffuse ignore it, except that with views and predicted obstacles in unknown
-            space, "first" makes them plan fewer motions.
+            rrt_connect and robotdiffuse ignore it, with one exception: for a problem with views whose unknown
+            space is `predicted`, "first" makes them plan fewer motions.
         clearance: Distance to obstacles that aorrtc, rrt_connect and robotdiffuse keep wherever start, goal
             and passages allow it, at most 0.5 [m]. Elsewhere the distance is smaller, and a note says so.
             None: the problem's clearance, or 1 cm if it has none. Other planners refuse a clearance.
         velocity_scaling: Fraction of the velocity limits that the motion uses, from 0.001 to 1.
         acceleration_scaling: Fraction of the acceleration limits that the motion uses, from 0.001 to 1.
-        jerk: Largest jerk of any joint [rad/s³], at least 0.01; infinite (`--jerk none`): no limit. None:
-            each joint's own jerk limit; for a joint without one, 10 times its acceleration limit, per second.
+        jerk: Largest jerk of any joint [rad/s³], at least 0.01. None: each joint's own jerk limit; for a
+            joint without one, 10 times its acceleration limit, per second. Infinite (`--jerk none`): no
+            limit.
         objective: What aorrtc, rrt_connect and robotdiffuse minimize: "time", the motion's duration, or
             "length" of the path in joint space.
         planner: A name that `robotdiffuse planner list` shows. A planner stays loaded for later calls with

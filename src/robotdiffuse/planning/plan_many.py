@@ -170,7 +170,8 @@ def _plan_on_node(
 
 
 def _error(planner: str, problem: Problem, reason: str, request: PlanRequest) -> PlanResult:
-    return PlanResult(Status.ERROR, reason, planner, problem.robot.name, 0.0, request.seed)
+    failed = PlanResult(Status.ERROR, reason, planner, problem.robot.name, 0.0, request.seed)
+    return replace(failed, problem=problem)
 
 
 class _Session:

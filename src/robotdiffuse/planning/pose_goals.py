@@ -155,7 +155,7 @@ def _tightened(pose: PoseGoal, fraction: float) -> PoseGoal:
 def _combined(
     problem: Problem, poses: Sequence[PoseGoal], solutions: Sequence[ndarray], rng: np.random.Generator
 ) -> Configurations:
-    """Seeds for several poses: random combinations of `solutions`. These are, for each pose, configurations
+    """Seeds for several poses: random combinations of `solutions`, which holds for each pose configurations
     that reach it, regardless of the other poses. A joint that moves several links takes its value from the
     configuration for one of their poses, chosen at random. No rows if some pose has no configuration."""
     seeds = np.tile(problem.start, (SEEDS if all(len(rows) for rows in solutions) else 0, 1))

@@ -301,7 +301,7 @@ def values(rows, q):
 
 @kernel()
 def speeds(rows, m, q, rates):
-    """Speed of the origin of the frame of row m [n] at configurations [n, dof] with joint rates [n, dof]."""
+    """Speeds [n] of the origin of row m's frame at configurations [n, dof] with joint rates [n, dof]."""
     work = make_work(rows)
     out = np.empty(len(q))
     for i in range(len(q)):

@@ -59,7 +59,7 @@ from robotdiffuse.problems.moveit import (
 )
 from robotdiffuse.problems.problem import Goal, JointGoal, PoseGoal, Problem, moved
 from robotdiffuse.robots import FILE_ENDINGS, ROBOTS, load_robot
-from robotdiffuse.robots.robot import MIMIC_SLACK, Robot
+from robotdiffuse.robots.robot import MIMIC_SLACK, Robot, robot_fingerprint
 from robotdiffuse.scenes.files import check_fields, read_scene
 from robotdiffuse.scenes.scene import Scene
 
@@ -175,6 +175,11 @@ def problem_record(
             raise InputError(
                 f"robot {shown(robot)} is neither bundled nor read from a file; give the path of its URDF as "
                 "robot"
+            )
+        arm = problem.robot.arm
+        if robot_fingerprint(load_robot(robot, dict(arm.locked))) != robot_fingerprint(arm):
+            raise InputError(
+                f"robot was changed after it was read from {shown(robot)}; give its file as robot"
             )
     folder = None if folder is None else Path(folder)
     T = problem.T_world_base

@@ -19,6 +19,7 @@ from robotdiffuse.core.errors import (
     joined,
     located,
     numbers,
+    repeated,
     shortened,
     shown,
     unit_quaternion,
@@ -67,6 +68,8 @@ GOAL_FIELDS = (
     "name",
     *(f"{kind}_constraints" for kind in ("joint", "position", "orientation", "visibility")),
 )
+STATE_FIELDS = ("joint_state", "multi_dof_joint_state", "attached_collision_objects", "is_diff")
+ATTACHED_FIELDS = ("link_name", "object", "touch_links", "detach_posture", "weight")
 ADDITIONS = (None, 0, 2, "\0", "\2", b"\0", b"\2")
 """Values of an object's field `operation` that mean to add it or to append to it."""
 
@@ -132,7 +135,15 @@ def joint_state(state: JsonObject, where: str) -> dict[str, float]:
     where = f"{where}.joint_state"
     names = list_of(f"{where}.", joints, "name")
     positions = vector(where, "position", list_of(f"{where}.", joints, "position"), len(names))
-    return dict(zip(map(str, names), positions.tolist(), strict=True))
+    return _by_joint(where, names, positions)
+
+
+def _by_joint(where: str, names: Iterable[object], values: Iterable[float]) -> dict[str, float]:
+    joint_names = list(map(str, names))
+    twice = repeated(joint_names)
+    if twice:
+        raise InputError(f"{where} has {joined(twice)} more than once")
+    return dict(zip(joint_names, map(float, values), strict=True))
 
 
 def frame_name(where: str, entry: JsonObject) -> str:
@@ -203,7 +214,8 @@ def moveit_frames(data: object, robot: Robot) -> MoveItFrames:
     robot's root, by default `world`. Raises InputError if the field has more than one transform, if
     robot_state has attached objects, and for wrong transforms and unknown frames.
     """
-    if mapping_of(SCENE, data, "robot_state").get("attached_collision_objects"):
+    state = check_fields("robot_state", mapping_of(SCENE, data, "robot_state"), (), STATE_FIELDS)
+    if state.get("attached_collision_objects"):
         raise InputError("robot_state has attached_collision_objects; they belong to a request's start_state")
     location = "multi_dof_joint_state"
     floating = mapping_of(SCENE, data, "robot_state", location)
@@ -574,7 +586,7 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
             notes.append(
                 f"the request's {name} {factor:g} is ignored: plan with {quantity}_scaling={factor:g}"
             )
-    state = mapping_of(REQUEST, data, "start_state")
+    state = check_fields("start_state", mapping_of(REQUEST, data, "start_state"), (), STATE_FIELDS)
     attached = tuple(
         _attached(location, entry, frames, folder)
         for location, entry in mappings_of("", state, "attached_collision_objects")
@@ -611,6 +623,7 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
 
 
 def _attached(location: str, entry: JsonObject, frames: MoveItFrames, folder: Path) -> MoveItAttached:
+    check_fields(location, entry, (), ATTACHED_FIELDS)
     link = str(entry.get("link_name") or "")
     location, object_entry = f"{location}.object", mapping_of(location, entry, "object")
     in_link = frame_name(location, object_entry) == link
@@ -631,10 +644,9 @@ def _joint_goal(where: str, goal: JsonObject, notes: list[str]) -> dict[str, flo
         tolerances = numbers([entry.get(f"tolerance_{side}", 0) for side in ("above", "below")])
         if tolerances is not None and tolerances.max() > WIDE_ANGLE:
             notes.append(f"{at}: its tolerance of {tolerances.max():g} is ignored")
-    return {
-        str(entry.get("joint_name")): float(vector(at, "position", [entry.get("position")], 1)[0])
-        for at, entry in entries
-    }
+    names = [entry.get("joint_name") for _, entry in entries]
+    positions = [vector(at, "position", [entry.get("position")], 1)[0] for at, entry in entries]
+    return _by_joint(where, names, positions)
 
 
 def _wide_tolerances(region: JsonObject, orientation: JsonObject) -> list[str]:
@@ -665,6 +677,8 @@ def _pose_goal(where: str, goal: JsonObject, frames: MoveItFrames, notes: list[s
         raise InputError(
             f"{where} constrains {link} and {orientation.get('link_name')}; both must constrain one link"
         )
+    if not isinstance(link, str):
+        raise InputError(f"{at}.link_name is {shown(link)}; it must be the name of a link")
     offset = xyz_of("target_point_offset", position.get("target_point_offset") or [0, 0, 0])
     if offset.any():
         raise InputError(f"{at}.target_point_offset is {shown(offset)}; it must be zero")

@@ -69,7 +69,7 @@ def names_a_file(name: str | Path) -> bool:
     """Whether `load_robot` takes this name as the path of a file or folder; else it looks up a robot's
     name."""
     text = str(name)
-    by_form = text.endswith(FILE_ENDINGS) or "/" in text or "\\" in text
+    by_form = text.lower().endswith(FILE_ENDINGS) or "/" in text or "\\" in text
     folder = text not in ROBOTS and is_file(Path(name) / ROBOT_FILE)
     return by_form or isinstance(name, Path) or folder
 

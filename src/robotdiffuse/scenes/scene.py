@@ -64,7 +64,7 @@ MAX_CONTACT_LINKS = 1000
 """Largest number of links that `Scene.allowed_contacts` may name for one obstacle."""
 
 PLANE_SIZE = 10.0
-"""Smallest edge of the box that stands for a plane [m]."""
+"""Smallest length and width of the box that stands for a plane [m]."""
 PLANE_DEPTH = 0.1
 """Thickness of the boxes that stand for planes [m]."""
 MOVED = 1e-4
@@ -138,8 +138,8 @@ class Scene(Value):
                 reads from a model has the base "world".
 
         Returns:
-            The scene. A plane, which collides without end in MuJoCo, becomes a box with edges of at least
-            10 m around the base. Meshes are replaced by their convex hulls, as MuJoCo does.
+            The scene. A plane, which is infinite in MuJoCo, becomes a box around the base, 0.1 m thick and at
+            least 10 m long and wide. Meshes are replaced by their convex hulls, as MuJoCo does.
 
         Raises:
             InputError: For an unknown body, for soft bodies, height fields and signed distance fields, and if
@@ -335,8 +335,8 @@ def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
         mujoco.mj_differentiatePos(model, change, 1.0, model.qpos0, placed.qpos)
         if (np.abs(change[placing]) > MOVED).any():
             raise InputError(
-                "data moves the robot, which is held where the model places it; take a body that moves with "
-                "it as the base, here by base=BODY and in `robot add` by --base BODY"
+                "data moves the robot, but a robot is loaded where the model places it; take a body that "
+                "moves with the robot as the base, here by base=BODY and in `robot add` by --base BODY"
             )
     T_base_world = inverse(transform(placed.xpos[base_body], placed.xmat[base_body].reshape(3, 3)))
     colliding = mjcf.colliding_geoms(model)
@@ -579,8 +579,11 @@ class MovingObstacle(Value):
         """
         T = rigid_motion(T)
         velocity = None if self.velocity is None else T[:3, :3] @ self.velocity
-        poses = None if self.poses is None else T @ self.poses
-        return replace(self, shape=self.shape.moved(T), velocity=velocity, poses=poses)
+        shape = self.shape.moved(T)
+        # a sphere's frame does not turn with it
+        between = inverse(T @ self.shape.T_base_shape) @ shape.T_base_shape
+        poses = None if self.poses is None else T @ self.poses @ between
+        return replace(self, shape=shape, velocity=velocity, poses=poses)
 
 
 def track_speeds(times: Values, poses: Poses, radius: float) -> Float[ndarray, "intervals"]:

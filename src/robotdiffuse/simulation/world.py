@@ -400,9 +400,9 @@ def replay(
 ) -> Replay:
     """Simulate a trajectory, and then REST_TIME of rest.
 
-    An obstacle that the arm hits blocks it; the simulation continues to the end. Moving obstacles move until
-    the trajectory ends; obstacles of unknown motion stand still. Raises InputError for a trajectory of other
-    joints.
+    If the arm hits an obstacle, the obstacle blocks it; the simulation continues to the end. Moving obstacles
+    move until the trajectory ends; obstacles of unknown motion stand still. Raises InputError for a
+    trajectory of other joints.
     """
     if trajectory.joint_names != robot.joint_names:
         raise InputError(

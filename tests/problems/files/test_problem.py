@@ -512,6 +512,14 @@ def test_a_robot_may_have_the_name_of_a_file() -> None:
     assert problem_from_record(PLAIN | {"robot": "arm.urdf"}, {"arm.urdf": PANDA}).robot is PANDA
 
 
+def test_a_robot_that_was_changed_is_not_saved_by_its_name() -> None:
+    """Regression: a robot placed in the world was read again where it had stood before."""
+    placed = PANDA.placed_in_world(transform(Z))
+    slow = replace(PANDA, joints=tuple(replace(j, velocity=j.velocity / 2) for j in PANDA.joints))
+    for robot in (placed, slow):
+        refuses("robot was changed", problem_record, rd.Problem(robot, rd.Scene(), HOME, HOME))
+
+
 def test_a_second_shape_of_one_name_is_noted(tmp_path: Path) -> None:
     problem = rd.load_problem(written(tmp_path, PLAIN | {"scene": [WALL, WALL]}))
     assert problem.notes == ("scene[1]: an earlier shape is named wall too; this one is wall_2",)

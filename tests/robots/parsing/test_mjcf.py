@@ -34,6 +34,12 @@ def read(folder: Path, text: str) -> UrdfTree:
     return UrdfTree(folder / "m.xml", {})
 
 
+def test_models_without_a_name_have_that_of_their_file(tmp_path: Path) -> None:
+    """Regression: all were called "MuJoCo Model", and the second that was added replaced the first."""
+    body = '<body><joint range="-90 90"/><geom size="0.1"/></body>'
+    assert read(tmp_path, f"<mujoco><worldbody>{body}</worldbody></mujoco>").name == "m"
+
+
 def state_of(model: Any, robot: rd.Robot, q: np.ndarray) -> Any:
     """MuJoCo's data at a configuration of the robot; other joints have their locked values."""
     data = mujoco.MjData(model)
@@ -212,7 +218,7 @@ def test_a_scene_around_a_robot_that_has_moved_names_its_base() -> None:
     data.qpos[1] = 0.5  # a joint that is planned
     assert len(rd.Scene.from_mujoco(model, data).shapes) == 1
     data.qpos[0] += 0.4
-    refuses("data moves the robot, which is held where", rd.Scene.from_mujoco, model, data)
+    refuses("data moves the robot, but a robot is loaded where", rd.Scene.from_mujoco, model, data)
     [shape] = rd.Scene.from_mujoco(model, data, base="base").shapes
     np.testing.assert_allclose(shape.bounds.mean(axis=0), [0.6, 0, 0], atol=1e-12)
 

@@ -145,6 +145,10 @@ def test_limits_file(tmp_path: Path) -> None:
     assert robot.planned_joints[0].effort == 9
     found = [robot.lower, robot.velocity, robot.acceleration, robot.jerk]
     np.testing.assert_allclose(found, [[-2, -1], [2, 1], [8, 3.5], [80, 35]])
+    # regression: a lower velocity raised the acceleration that the URDF states
+    stated = replace(robot, joints=tuple(replace(j, acceleration=2.0, jerk=20.0) for j in robot.joints))
+    slower = with_limits(stated, {"turn": {"velocity": 1.5}}).planned_joints[0]
+    assert (slower.velocity, slower.acceleration, slower.jerk) == (1.5, 2.0, 20.0)
     file.write_text("default_velocity_scaling_factor: 0.1\njoint_limits: {j: {max_velocity: 1}}\n")
     note = "limits.yaml: default_velocity_scaling_factor 0.1 is ignored; plan with velocity_scaling=0.1"
     assert read_limits(file) == ({"j": {"velocity": 1.0}}, (note,))

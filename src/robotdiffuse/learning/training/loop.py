@@ -469,8 +469,8 @@ class TrainingRun:
                     part, _, name = key.partition(".")
                     states[part][name] = stored.get_tensor(key)
             self._check_same(notes["settings"] | notes["identity"])
-            about = self.task.about()
-            if self.processes.first and notes.get("about", about) != about:
+            data = self.task.about().get("data")
+            if self.processes.first and notes.get("about", {"data": data}).get("data") != data:
                 print(f"{self._file} was trained on other data; the training goes on", file=sys.stderr)
             self.module.load_state_dict(states.pop("module"))
             self.average.load_state_dict(states.pop("average"))
@@ -520,7 +520,8 @@ def train(task: TrainingTask, out: str) -> dict[str, float]:
             run.diverged()
         report = task.finish() | {"samples": float(run.at.samples)}
         minutes = round(run.at.seconds / 60, 2)
-        about = {"settings": task.settings.to_json(), **task.about(), "minutes": minutes, **report}
+        about = {"settings": task.settings.to_json(), **task.about(), "minutes": minutes}
+        about |= {name: value for name, value in report.items() if math.isfinite(value)}
         today = f"{datetime.now(UTC):%Y-%m-%d}"
         versions = {"robotdiffuse": __version__, "torch": torch.__version__}
         task.save(Path(out), about | versions | {"made": today})

@@ -61,7 +61,7 @@ from robotdiffuse.perception.occupancy_map import (
     lost_regions,
     probability_free,
 )
-from robotdiffuse.perception.pose_refinement import PoseRefinement, is_on
+from robotdiffuse.perception.pose_refinement import PoseRefinement, mounted
 from robotdiffuse.perception.seen_points import point_shapes, seen_shapes
 from robotdiffuse.perception.voxel_grid import LAYERS_BELOW, MAP, Probabilities, Voxels, surface
 from robotdiffuse.planning import load_planner
@@ -249,8 +249,8 @@ class Explorer:
         self._planner = load_planner("robotdiffuse")
         self._seed = converted("seed", Natural, seed)
         self._rng = np.random.default_rng(seed)
-        on_arm = [(camera.link, camera.T_link_camera) for camera in cameras]
-        self._poses = PoseRefinement(robot, scene, on_arm)
+        self._on_arm = [(camera.link, camera.T_link_camera) for camera in cameras]
+        self._poses = PoseRefinement(robot, scene, self._on_arm)
         self._views = ViewMemory(robot)
         self._goal_seen = GoalSeen(robot, self.map, self._views, settings.see_goal)
         self._goal: Goal | None = None
@@ -530,27 +530,23 @@ class Explorer:
         # the arm cannot go back far along its latest motion: there is none, or it was short
         hemmed_in = way_in is None or bool(moved(self.robot, way_in[:1], [problem.start])[0] < CONFINED)
         taken = self._goal_seen.taken
-        for camera in self.cameras:
-            arguments = wanted, predicted, self._rng, taken, hemmed_in, self._fixed_view
-            paths = best_viewpoints(self.map, tree, camera, *arguments)
-            for waypoints in islice(paths, self.settings.look_attempts):
-                if policy == STRICT:
-                    motion = self._along(allowed, waypoints, "look")
-                else:
-                    look = replace(problem, goal=JointGoal(waypoints[-1:]))
-                    motion = self._probabilistic(look, predicted, self.settings.time_limit, to_goal=False)
-                if motion is not None and self._keeps(motion, policy):
-                    return motion
+        arguments = wanted, predicted, self._rng, taken, hemmed_in, self._fixed_view
+        paths = best_viewpoints(self.map, tree, self.cameras, *arguments)
+        for waypoints in islice(paths, len(self.cameras) * self.settings.look_attempts):
+            if policy == STRICT:
+                motion = self._along(allowed, waypoints, "look")
+            else:
+                look = replace(problem, goal=JointGoal(waypoints[-1:]))
+                motion = self._probabilistic(look, predicted, self.settings.time_limit, to_goal=False)
+            if motion is not None and self._keeps(motion, policy):
+                return motion
         return None
 
     def _camera_of(self, view: DepthView) -> int | None:
         """The index of the arm's camera that took a view; None for a camera that is not on the arm."""
         q = view.configuration
         assert q is not None  # the map takes no other views
-        for number, camera in enumerate(self.cameras):
-            if is_on(self.robot, camera.link, camera.T_link_camera, view.T_base_camera, q):
-                return number
-        return None
+        return mounted(self.robot, self._on_arm, view.T_base_camera, q)
 
     def _way_in_to(self, q: Configuration) -> Configurations | None:
         """Waypoints of the latest motion that was returned, if it ended at this configuration."""

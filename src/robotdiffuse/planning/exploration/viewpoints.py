@@ -52,7 +52,7 @@ from robotdiffuse.perception.occupancy_map import (
     without_known,
 )
 from robotdiffuse.perception.ray_caster import looking_at
-from robotdiffuse.perception.seen_points import sphere_distances
+from robotdiffuse.perception.seen_points import near_scene, sphere_distances
 from robotdiffuse.perception.visibility import (
     BALL_RADIUS,
     see_through,
@@ -383,7 +383,7 @@ def swept_unseen(known: OccupancyMap, path: Path) -> Voxels:
 def best_viewpoints(
     known: OccupancyMap,
     tree: ReachableTree,
-    camera: ArmCamera,
+    cameras: Sequence[ArmCamera],
     wanted: Voxels,
     probability: Probabilities | None,
     rng: np.random.Generator,
@@ -391,11 +391,11 @@ def best_viewpoints(
     hemmed_in: bool = False,
     fixed_view: DepthView | None = None,
 ) -> Iterator[Configurations]:
-    """Yields paths to viewpoints from which the camera sees wanted voxels, the best first.
+    """Yields paths to viewpoints from which a camera sees wanted voxels, the best first.
 
-    The score of a viewpoint is the weight of the wanted voxels that it sees, reduced for viewpoints far from
-    the start. A voxel counts with the probability that nothing hides it: neither the arm, nor occupied or
-    predicted voxels.
+    The score of a viewpoint is the weight of the wanted voxels that its best camera sees, reduced for
+    viewpoints far from the start. A voxel counts with the probability that nothing hides it: neither the arm,
+    nor occupied or predicted voxels.
 
     tree: configurations that the arm can reach; it grows here.
     probability: the predicted probability that each voxel is occupied, which adds to its weight; None without
@@ -422,7 +422,7 @@ def best_viewpoints(
         at = at[chosen]
         weights = weights[chosen]
     space = at, weights, filled, MAP
-    start, (width, height) = tree.configurations[0], camera.size
+    start = tree.configurations[0]
     seen_at_start = 0.0
     if fixed_view is not None:
         K, size = fixed_view.intrinsics, fixed_view.depth.shape
@@ -432,8 +432,8 @@ def best_viewpoints(
 
     def scored(q: Configurations) -> Values:
         """The scores of configurations; 0 for configurations that see less than MIN_SEEN."""
-        poses = camera.poses(robot, q)
-        seen = seen_share(robot, q, poses, camera.intrinsics, (height, width), camera.range, *space)
+        each = [(c.poses(robot, q), c.intrinsics, c.size[::-1], c.range) for c in cameras]
+        seen = np.max([seen_share(robot, q, *camera, *space) for camera in each], axis=0)
         if fixed_view is not None:
             poses = np.repeat(T, len(q), axis=0)
             seen_now = seen_share(robot, q, poses, K, size, reach, *space)
@@ -556,6 +556,9 @@ def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None
     filled = refined(volume.occupied).astype(np.float32)
     if predicted is not None:
         np.maximum(filled, predicted, out=filled)
+    centers = FINE.centers(np.argwhere(np.ones(FINE.shape)))
+    known = near_scene(problem.robot, problem.known_scene, centers, FINE.edge / 2)
+    filled[known.reshape(FINE.shape)] = 1.0
     image = problem.views[0]
     q = np.tile(problem.start, (len(candidates), 1))
     size = image.depth.shape

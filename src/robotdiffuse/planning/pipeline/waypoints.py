@@ -36,7 +36,9 @@ from robotdiffuse.planning.context import (
     least_clearances,
 )
 from robotdiffuse.problems.constraints import CartesianLine
+from robotdiffuse.problems.fields import FIELDS
 from robotdiffuse.problems.problem import Goal, JointGoal, Problem
+from robotdiffuse.robots.robot import robot_fingerprint
 from robotdiffuse.trajectories.speed_limits import DEFAULT as TIMING
 from robotdiffuse.trajectories.speed_limits import stopping_distance, within_limits
 from robotdiffuse.trajectories.timing import joined_rows
@@ -270,14 +272,16 @@ def join(
     shared = [
         constraint
         for constraint in first.constraints
-        if all(constraint in problem.constraints for problem in problems)
+        if all(
+            _entry("constraints", [constraint])[0] in _entry("constraints", problem.constraints)
+            for problem in problems
+        )
         and not isinstance(constraint, CartesianLine)
     ]
-    shared_by_all = attrgetter(
-        "robot", "scene.shapes", "scene.allowed_contacts", "moving", "views", "payload"
-    )
+    objects = attrgetter("robot", "scene.shapes", "scene.allowed_contacts", "moving", "views", "payload")
     for i, (before, after) in enumerate(pairwise(results), 1):
-        if shared_by_all(after.problem) != shared_by_all(first):
+        same_objects = objects(after.problem) == objects(first)
+        if not same_objects and _content(after.problem) != _content(first):
             raise InputError(
                 f"results[{i}] is for another robot, scene or payload than results[0]; execute these motions "
                 "separately"
@@ -310,6 +314,18 @@ def join(
         for result in results
     ]
     return replace(_joined(context, segments, _motions(context, segments)), problem=problem)
+
+
+def _content(problem: Problem) -> list[object]:
+    """What joined motions share, by value: equal also for different objects, such as unpickled ones."""
+    scene = [_entry(name, problem.scene) for name in ("scene", "allowed_contacts")]
+    payload = problem.payload and _entry("payload", problem.payload)
+    return [robot_fingerprint(problem.robot), problem.views, _entry("moving", problem.moving), payload, scene]
+
+
+def _entry(name: str, value: object) -> Any:
+    """The value of a field as in a file."""
+    return FIELDS[name].write(value, None)
 
 
 def plan_from_start_velocity(planner: Solver, problem: Problem, request: PlanRequest) -> PlanResult:

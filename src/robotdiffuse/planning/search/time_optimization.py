@@ -271,7 +271,7 @@ class TimeOptimization:
         )
 
     def offer(self, space: Space, path: Configurations, stage: str) -> None:
-        """Make a path whose polyline is free in `space` a candidate, if it is among the fastest."""
+        """Add a path to the candidates if it is among the fastest. Its polyline must be free in `space`."""
         path = with_corner(path)
         deviations = free_deviations(space, path, self._settings.corner_deviation)
         time = float(estimated_time(rounded_line(path, deviations), *self._limits))
@@ -281,8 +281,8 @@ class TimeOptimization:
         self._sort()
 
     def improve(self, space: Space) -> None:
-        """Make ATTEMPTS attempts to make one candidate faster: three times the fastest one, then once
-        another; the others take turns."""
+        """Make ATTEMPTS attempts to make one candidate faster. In three of four calls it is the fastest one,
+        in the fourth call another; the others take turns."""
         self._turn += 1
         runners_up = len(self.candidates) - 1
         cycle, turn = divmod(self._turn, BEST_TURNS + 1)

@@ -165,7 +165,7 @@ fraction of the best volume."""
 MAX_WALLS = 6
 """Largest number of surfaces perpendicular to an axis at which further cuts are tried."""
 MAX_CUT_POINTS = 1200
-"""Approximate largest number of surface points for choosing a cut."""
+"""Largest number of surface points for choosing a cut."""
 MAX_NORMALS = 1000
 """If a hull has more faces, similar normals are merged before it is simplified."""
 TIGHT_PART_FACTOR = 4
@@ -186,9 +186,9 @@ class PartSettings:
     """Largest number of parts of a link, or two for each of its surfaces if that is more. For a link with
     tight places, TIGHT_PART_FACTOR times this number."""
     voxels: int = 400_000
-    """Approximate number of voxels of the grid that measures concavity."""
+    """Approximate number of voxels of the grid that measures concavity; with tight places, 8 times this."""
     finest: float = 0.0015
-    """Smallest voxel edge [m]."""
+    """Smallest voxel edge [m]; with tight places, half of this."""
     faces: int = 400
     """Hulls with more triangles are simplified. A simplified hull contains the original one."""
     rounding: float = 5e-4

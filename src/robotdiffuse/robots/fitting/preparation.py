@@ -412,8 +412,9 @@ def _with_tables(
 
 
 def _beyond_spheres(robot: Robot, pair: PairFalseCollisions, settings: PreparationSettings, k: int) -> bool:
-    """Whether a table should replace the spheres of a pair: one or two joints are between the links, and even
-    the finest spheres would collide falsely too often, or those of an earlier refinement (`k` > 0) do."""
+    """Whether a table should replace the spheres of a pair. For this, one or two joints must be between the
+    links. In addition, even the finest spheres would collide falsely too often, or, after an earlier
+    refinement (`k` > 0), the present spheres do."""
     narrow_fraction = (pair.gaps < 2 * settings.finest).mean() if len(pair.gaps) else 0.0
     if k:
         narrow_fraction = 1.0
@@ -475,7 +476,7 @@ MAX_PROPOSED = 3
 although no single pair always collides."""
 ASSUMED_SAFE = {
     "default": "also with all joints between them at zero: the meshes are assumed to be too large",
-    "limits": "up to a limit of one joint: the limit is assumed to be where the links meet",
+    "limits": "in a range of one joint up to its limit, where the links are assumed to meet",
     "pose": "also in a pose that the SRDF names: the meshes are assumed to be too large",
 }
 """Reasons for allowing a pair that a person should check, each with an explanation for the warning."""
@@ -615,7 +616,7 @@ def add_robot(
         if len(pair) != 2 or pair[0] == pair[1]:
             raise InputError(f"allow has the entry {shown(pair)}; it must name two links")
     name = name or robot.name
-    ambiguous = out is None and (name in ROBOTS or name.endswith(FILE_ENDINGS) or "\\" in name)
+    ambiguous = out is None and (name in ROBOTS or name.lower().endswith(FILE_ENDINGS) or "\\" in name)
     if ambiguous or Path(name).name != name or name.startswith(".") or not name.isprintable():
         raise InputError(
             f"robot name is {name!r}; it must be a valid folder name, but not that of a file or a "

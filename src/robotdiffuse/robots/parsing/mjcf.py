@@ -125,7 +125,9 @@ class ConvertedModel:
         self.model = model = compiled_model(path)
         self.folder = TemporaryDirectory(prefix="robotdiffuse-mjcf-")
         """Contains the mesh files that the URDF names."""
-        self.root = ET.Element("robot", name=bytes(model.names).partition(b"\0")[0].decode() or path.stem)
+        name = bytes(model.names).partition(b"\0")[0].decode()
+        # MuJoCo's name for models without one
+        self.root = ET.Element("robot", name=path.stem if name in ("", "MuJoCo Model") else name)
         self.bodies = robot_bodies(model)
         self.held = placing_joints(model, self.bodies)
         self.colliding = colliding_geoms(model)

@@ -313,10 +313,11 @@ class UrdfTree:
             digest.update(repr((allowed, self.semantics.poses)).encode())
         for element in self.links.values():
             for mesh in element.findall(f"{self.kind}/geometry/mesh"):
-                file = self.packages.file(mesh.get("filename", ""))
-                digest.update(read_bytes(file, "mesh file"))
-                if file.suffix.lower() == ".gltf":  # its buffers may be other files
-                    digest.update(read_triangles(file)[0].tobytes())
+                with suppress(InputError):  # links above the base may lack their meshes
+                    file = self.packages.file(mesh.get("filename", ""))
+                    digest.update(read_bytes(file, "mesh file"))
+                    if file.suffix.lower() == ".gltf":  # its buffers may be other files
+                        digest.update(read_triangles(file)[0].tobytes())
         return digest.hexdigest()
 
     @cached_property
@@ -711,12 +712,13 @@ def with_limits(robot: Robot, limits: Mapping[str, dict[str, float]]) -> Robot:
     for a lower limit above the upper one.
 
     A new velocity limit also sets the acceleration limit, and a new acceleration limit the jerk limit, in the
-    default ratios, unless these limits are given too. A continuous joint with a position limit becomes
-    revolute; if only one of its limits is given, the other one is half a turn from zero.
+    default ratios, unless these limits are given too, or were stated by the URDF. A continuous joint
+    with a position limit becomes revolute; if only one of its limits is given, the other one is half a turn
+    from zero.
     """
     movable = [joint.name for joint in robot.joints if joint.movable]
     for name in limits:
-        check_name("joint in joint_limits", name, movable)
+        check_name(f"movable joint below {robot.base} in joint_limits", name, movable)
     return replace(robot, joints=tuple(_changed(joint, limits.get(joint.name, {})) for joint in robot.joints))
 
 
@@ -747,9 +749,11 @@ def _fields(file: str, joint: str, entry: object) -> dict[str, float]:
 
 
 def _changed(joint: Joint, fields: dict[str, float]) -> Joint:
-    if "velocity" in fields and "acceleration" not in fields:
+    default = joint.acceleration == ACCELERATION_PER_VELOCITY * joint.velocity  # a new joint has zeros
+    if "velocity" in fields and "acceleration" not in fields and default:
         fields = fields | {"acceleration": ACCELERATION_PER_VELOCITY * fields["velocity"]}
-    if "acceleration" in fields and "jerk" not in fields:
+    default = joint.jerk == JERK_PER_ACCELERATION * joint.acceleration
+    if "acceleration" in fields and "jerk" not in fields and default:
         fields = fields | {"jerk": JERK_PER_ACCELERATION * fields["acceleration"]}
     if joint.kind == "continuous" and {"lower", "upper"} & fields.keys():
         joint = replace(joint, kind="revolute", lower=-math.pi, upper=math.pi)

@@ -114,7 +114,7 @@ class State:
     failure: str = ""
     """Why the planner could not run, in one line; empty if it could."""
     motion: PlanResult | None = None
-    """The result with the shown motion: the last result that has a motion."""
+    """The result whose motion is shown. A motion for an outdated version is shown only if it is free."""
     validation: Validation | None = None
     """Validation of the shown motion. Until the validation for this version is complete, it is one of an
     earlier version."""
@@ -567,7 +567,7 @@ class Changes:
         self._shown: dict[str, tuple[object, ...]] = {}
 
     def new(self, what: str, *values: object) -> bool:
-        """Whether values differ from the last values with the name `what`, and remember them. Floats, texts
+        """Whether values differ from the last values with the name `what`; remembers them. Floats, texts
         and tuples are compared by value, other objects by identity."""
         last_values = self._shown.get(what)
         self._shown[what] = values

@@ -153,6 +153,7 @@ WRONG_SCENES: dict[str, tuple[object, str]] = {
     "misspelled world": ({"world": {"objects": []}}, "unknown field of world: 'objects'"),
     "misspelled object": (scene_data(primitive=[]), "unknown field of the object: 'primitive'; .* mean primitives"),
     "empty": (None, "a planning scene is None"),
+    "misspelled state": ({"robot_state": {"joint_states": {}}}, "unknown field of robot_state: 'joint_states'"),
     "attached": ({"robot_state": {"attached_collision_objects": [1]}}, "attached_collision_objects"),
 }
 
@@ -356,14 +357,23 @@ def test_scaling_factors_padding_and_the_velocity_of_a_start_state_are_noted() -
     assert "is a difference (is_diff)" in change and ignored == "the scene's link_padding of panda_hand is ignored"
 
 
+TWICE = {"name": ["a", "b", "a"], "position": [0.0, 0.5, 1.0]}
+
+
 def test_wrong_requests() -> None:
     attached = ["start_state", "attached_collision_objects"]
     poses = [pose_constraint(), pose_constraint()]
+    nameless = pose_request(["position_constraints", 0, "link_name"], None)
+    nameless = change(nameless, ["goal_constraints", 0, "orientation_constraints", 0, "link_name"], None)
     for data, message in (
         (request_data() | {"goal_constraints": []}, "goal_constraints is empty"),
         (request_data() | {"path_constraints": {"joint_constraints": [1]}}, "path_constraints"),
         (request_data() | {"max_velocity_scaling_factor": 2}, "is 2; it must be a number from 0 to 1"),
         (change(request_data(), attached, [1]), r"attached_collision_objects\[0\] is 1; it must be a mapping"),
+        (change(request_data(), attached, [{"touch_link": []}]), r"unknown field of .*\[0\]: 'touch_link'"),
+        (request_data() | {"start_state": {"attached_collision_object": []}}, "unknown field of start_state"),
+        (request_data() | {"start_state": {"joint_state": TWICE}}, "joint_state has a more than once"),
+        (nameless, "link_name is None; it must be the name"),
         (request_data() | {"goal_constraints": poses}, "joint_constraints alone; only a single goal may be a pose"),
         (pose_request(["orientation_constraints"], []), "one position and one orientation"),
         (pose_request(["position_constraints", 0, "target_point_offset"], [0, 0, 1]), "must be zero"),
