@@ -75,7 +75,7 @@ VIAS = "vias"
 NEAREST = "nearest_motions"
 NOISE = "smooth_noise"
 LIBRARY_SHARDS = 10
-"""Number of shards of a data set from which the nearest motions are taken: some thousand motions."""
+"""Number of shards of a data set from which the nearest motions are taken: a few thousand motions."""
 WAYPOINTS = 48
 """Number of waypoints of a candidate, as in the networks' motions."""
 SPREAD = 0.127
@@ -85,7 +85,7 @@ MAX_HALF_RANGE = np.pi
 """Upper bound on half the range of a joint in `smooth_noise` [rad], for continuous joints, which have no
 limits."""
 WAVES = 8
-"""Number of sines that are summed; more sines would change the sum by less than 1 %."""
+"""Number of sines that are summed; all further sines would add 0.2 % to the variance."""
 VARIANCE_EXPONENT = 3.5
 """The variance of the sine with k half waves is proportional to k to the power of minus this."""
 EQUAL_TIME_STEPS = 110
@@ -133,8 +133,8 @@ class Control(Planner[ControlSettings]):
     def candidates(
         self, start: Configuration, goals: Configurations, checker: CollisionChecker, rng: np.random.Generator
     ) -> Trajectories:
-        """Candidate motions from the start, after guidance: with smooth noise to the nearest goals, else to
-        the nearest goal. Motions through vias are in the order of the vias, the most useful first."""
+        """Candidate motions from the start, after guidance. Those with smooth noise lead to the nearest goals,
+        all others to the nearest goal. Motions through vias are in the order of the vias, the most useful first."""
         settings = self.settings
         goals = nearest_goals(start, goals, settings.samples)
         robot = checker.robot

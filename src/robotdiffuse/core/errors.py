@@ -142,7 +142,7 @@ def shortened(text: object, most: int = MAX_QUOTE) -> str:
 
 def described(error: BaseException) -> str:
     """The kind and the message of another library's error as one line. It may be long, since such messages
-    often name the file, line or element that is wrong at their end."""
+    often end with the file, line or element that is wrong."""
     return f"{type(error).__name__}: {shortened(error, MAX_WORD)}"
 
 

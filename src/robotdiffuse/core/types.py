@@ -157,7 +157,7 @@ def frozen_dataclass(kind: type[T]) -> type[T]:
 class Value:
     """Base of the dataclasses that are values: the arrays and dictionaries in their fields are read-only.
 
-    Caches use the object's identity as the key, so they must not change. What is writable is copied, so that
+    Caches use the object's identity as the key, so values must not change. What is writable is copied, so that
     the caller can still change it. A subclass that defines `__post_init__` calls this class's
     `__post_init__` at its end.
     """
@@ -204,7 +204,7 @@ def read_only(value: T) -> T:
 
 
 class ReadOnlyDict(dict[Any, Any]):
-    """A dictionary of a value. To have another one, change a copy: `dict(value.locked)`."""
+    """A read-only dictionary in a field of a `Value`. Its copy, dict(...), can be changed."""
 
     def _refuse(self, *_: Any, **__: Any) -> NoReturn:
         raise TypeError("this dictionary cannot be changed; change a copy: dict(...)")
@@ -296,8 +296,9 @@ class Trajectory(Value):
     """[rad/s²] or [m/s²]."""
 
     def __post_init__(self) -> None:
-        """Converts lists and integers to arrays of floats. If there are any, or the shapes differ, it raises
-        InputError as `check_motion_arrays` does; else the names and numbers are left to the validator."""
+        """Lists, integers and arrays whose shapes differ go through `check_motion_arrays`, which converts
+        them to arrays of floats or raises InputError. All other names and numbers are left to the
+        validator."""
         names = self.joint_names
         given = {name: getattr(self, name) for name in ("positions", "times", *RATES)}
         q, t, v, a = (
@@ -690,8 +691,8 @@ class PlanResult:
     """Problems with camera views: probability that the motion hits no obstacle in unknown space. `verify`
     checks observed obstacles only."""
     swept_probability: float | None = None
-    """Sum of the predicted occupancy probabilities of all unknown voxels that the motion sweeps; None without
-    the predicted policy for unknown space."""
+    """Sum of the predicted occupancy probabilities of all unknown voxels that the motion sweeps; None unless
+    the policy for unknown space is `predicted`."""
     unknown_region: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     """Lower and upper corner, in the base frame [m], of a box around the part of the unknown space
     that the motion crosses with the largest summed probability to be occupied; None if it crosses none."""

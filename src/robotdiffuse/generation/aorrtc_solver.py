@@ -23,8 +23,8 @@ ITERATIONS_PER_STEP = 500
 @dataclass(frozen=True)
 class AORRTCSearchSettings(Settings, name="aorrtc"):
     safety_distance: NotNegative = 0.05
-    """Distance to obstacles that paths keep [m]; the default follows from the scenes of the paper's
-    authors."""
+    """Distance to obstacles that paths keep [m]; by default, as much as the paper's authors enlarge
+    obstacles."""
     tries: Count = 1_500
     """The safety distance is lowered after this many iterations without a path. At the lowest distance, the
     search gives up after three times as many iterations."""

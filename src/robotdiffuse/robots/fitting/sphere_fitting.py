@@ -152,7 +152,7 @@ class Solid(NamedTuple):
     @property
     def inside(self) -> Points:
         """Grid points inside the solid. If none is deeper than half the spacing, the grid points whose
-        distance is less than half the spacing above the lowest one."""
+        distance exceeds the smallest distance by less than half the spacing."""
         distance = self.distance.ravel()
         return self.points[distance < max(0.0, float(distance.min()) + self.spacing / 2)]
 
@@ -497,8 +497,8 @@ def _without_holes(solid: Solid, inside: Points, spheres: Spheres) -> Spheres:
     could hide."""
     depth = solid.inscribed_sizes().at(inside)
     gap = gaps(inside, spheres)
-    # Every point is within `half`, half the diagonal of a grid cell, of a grid point. So deep in the solid, a
-    # sphere must contain the ball of this radius around the grid point; elsewhere, just the grid point.
+    # Every point is within `half`, half the diagonal of a grid cell, of a grid point. Therefore a sphere must
+    # contain the ball of this radius around a grid point deep in the solid; elsewhere, just the grid point.
     half = np.sqrt(0.75) * solid.spacing
     is_open = gap > np.where(depth > 2 * half, -half, 0.0)
     inside = inside[is_open]

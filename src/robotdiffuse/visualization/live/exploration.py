@@ -418,7 +418,7 @@ def exploration_badge(state: ExplorationState) -> Validity:
     if state.failure:
         return Validity(INVALID, "failed", (state.failure,))
     if not state.steps or state.phase == CHOOSING:
-        first = "a new machine compiles first, for about a minute"
+        first = "on a new machine, code is compiled first, for about a minute"
         lines = () if state.steps else (first,)
         doing = f"choosing step {len(state.steps) + 1}" if state.phase == CHOOSING else "not begun"
         return Validity(PENDING, doing, (*lines, *_shares(state)))

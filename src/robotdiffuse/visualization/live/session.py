@@ -429,7 +429,9 @@ def validity(state: State) -> Validity:
         if why_not:
             return Validity(NO_MOTION, "no plan", (why_not,))
         if state.planning:
-            return Validity(PENDING, "planning", ("a new machine compiles first, for about a minute",))
+            return Validity(
+                PENDING, "planning", ("on a new machine, code is compiled first, for about a minute",)
+            )
         return Validity(PENDING, "not planned yet")
     if validation is None:
         return Validity(PENDING, "validating")
