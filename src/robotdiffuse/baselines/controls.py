@@ -133,8 +133,9 @@ class Control(Planner[ControlSettings]):
     def candidates(
         self, start: Configuration, goals: Configurations, checker: CollisionChecker, rng: np.random.Generator
     ) -> Trajectories:
-        """Candidate motions from the start, after guidance. Those with smooth noise lead to the nearest goals,
-        all others to the nearest goal. Motions through vias are in the order of the vias, the most useful first."""
+        """Candidate motions from the start, after guidance. Those with smooth noise lead to the nearest
+        goals, all others to the nearest goal. Motions through vias are in the order of the vias, the most
+        useful first."""
         settings = self.settings
         goals = nearest_goals(start, goals, settings.samples)
         robot = checker.robot

@@ -20,8 +20,8 @@ from numba.core import caching, errors, event
 
 from robotdiffuse.core import loading
 
-# Numba imports SciPy in this module only to choose an algorithm for `np.convolve`. It would take 11 % of the
-# time of a `plan` command, so the import is made to fail.
+# `numba.np.arraymath` imports SciPy only to choose an algorithm for `np.convolve`. This would take 11 % of
+# the time of a `plan` command, so the import is made to fail.
 BLAS = "scipy.linalg.cython_blas"
 if BLAS not in sys.modules:
     sys.modules[BLAS] = None  # pyright: ignore[reportArgumentType]

@@ -157,8 +157,8 @@ def frozen_dataclass(kind: type[T]) -> type[T]:
 class Value:
     """Base of the dataclasses that are values: the arrays and dictionaries in their fields are read-only.
 
-    Caches use the object's identity as the key, so values must not change. What is writable is copied, so that
-    the caller can still change it. A subclass that defines `__post_init__` calls this class's
+    Caches use the object's identity as the key, so values must not change. What is writable is copied, so
+    that the caller can still change it. A subclass that defines `__post_init__` calls this class's
     `__post_init__` at its end.
     """
 

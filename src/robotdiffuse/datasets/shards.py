@@ -239,7 +239,8 @@ class Shard:
     index: int
     fingerprint: str
     counts: Counts
-    """Numbers of problems by outcome: tried, solved, unsolved, thinned, refused, ..."""
+    """Numbers of problems: all that were `tried`, and by outcome: `solved`, `unsolved`, `refused`, `thinned`
+    (trivial ones that were left out), ..."""
     arrays: Arrays
     """Arrays by their names in ARRAYS."""
 
@@ -404,9 +405,11 @@ def check_shapes(folder: str | FilePath, shard: Shard, manifest: Manifest) -> No
 
 
 def check_shard(folder: str | FilePath, index: int, manifest: Manifest) -> Shard:
-    """Read a shard and check shapes, types, finite numbers and the fingerprint; indices are not checked.
+    """Read a shard and check shapes, types, finite numbers and the fingerprint. Whether the values of `family`
+    and `goal_index` are valid indices is not checked.
 
-    Raises InputError, naming shard and array, for the first defect.
+    Raises InputError for the first defect. It names the shard and, unless only the fingerprint is wrong, the
+    array.
     """
     shard = read_shard(folder, index)
     path = shard_path(folder, index)
@@ -627,8 +630,8 @@ def turned(
     """Turn each motion and its scene by a random angle of at most pi, uniform within the limits of the first
     joint.
 
-    Returns the turned motions, the turned scenes, and which motions are free of self-collision: a motion
-    could be turned into the base link. `turns_about_vertical` must hold for the robot.
+    Returns the turned motions, the turned scenes, and which motions are free of self-collision: after the
+    turn, the arm may touch the base link. `turns_about_vertical` must hold for the robot.
     """
     first = q[:, :, 0]
     low = np.maximum(robot.lower[0] - first.min(1), -np.pi)

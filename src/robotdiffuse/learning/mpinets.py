@@ -238,7 +238,7 @@ class MPiNetsNetwork(BaselineNetwork):
         self.second = SetAbstraction(
             s.first_widths[-1], s.second_widths, s.centers[1], s.neighbors[1], RADII[1]
         )
-        # the layers on all points together; saved weights contain their name `layers`
+        # the layers on all points together; their key `layers` is part of the names in saved weights
         self.together = nn.ModuleDict({"layers": PooledLayers(3 + s.second_widths[-1], s.all_widths)})
         cloud_width, code = s.cloud_widths
         self.cloud_code = nn.Sequential(

@@ -389,9 +389,10 @@ def _robot(name: object, locked: object, folder: Path, robots: Mapping[str, Robo
         check_name("robot", name, robots)
     if not isinstance(name, str) or not name:
         raise InputError(
-            f"robot is {shown(name)}; it must be a name ({', '.join(ROBOTS)}, or added) or a robot's file"
+            f"robot is {shown(name)}; it must be a robot's file, or the name of an added robot or of a "
+            f"bundled one: {', '.join(ROBOTS)}"
         )
-    if robots is None and name not in ROBOTS and (name.endswith(FILE_ENDINGS) or "/" in name):
+    if robots is None and name not in ROBOTS and (name.lower().endswith(FILE_ENDINGS) or "/" in name):
         name = str((folder / name).absolute())
     values = converted("locked", dict[str, Number], locked)
     return load_robot(name, locked=values) if robots is None else robots[name].with_locked(values)

@@ -209,7 +209,7 @@ class AnyGoal(Value):
             The goals after the motion.
 
         Raises:
-            InputError: Unless T is rigid, if any of the goals is a pose.
+            InputError: If any of the goals is a pose and T is not rigid.
         """
         return AnyGoal(tuple(goal.moved(T) for goal in self.goals))
 

@@ -97,8 +97,8 @@ def make_clearance_workspace(robot, solids):
 @allocation_free(forceinline=True)
 def to_solid(points, velocities, solid):
     """Signed distances of the points in 16 lanes to a row of `SceneArrays.solids`, and how fast the points
-    move towards or away from the nearest points of the solid. This speed is 0 for points inside the box or
-    cylinder that the ball of the solid widens."""
+    move towards or away from the nearest points of the solid. A solid is a box or cylinder that a ball
+    widens; for points inside the box or cylinder, this speed is 0."""
     u, v, w = in_axes(solid, minus(points, solid))
     # velocity in the solid's axes; multiplied by the sign of the coordinate, it is the speed away from the
     # center

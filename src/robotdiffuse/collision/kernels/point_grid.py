@@ -121,8 +121,8 @@ def _max_offset(points, low, voxel):
 
 @inner_kernel(fastmath=True)
 def _settle(points, starts, balls, low, voxel, shape, band, distances, nearest):
-    """Lowers the distances that are too large, so that all below `band` are exact; the others are at least
-    `band` already."""
+    """Lowers the distances that are too large. Afterwards each voxel center that is nearer than `band` to a
+    point has its exact distance; the others keep their lower bounds, which are at least `band`."""
     nx, ny, nz = shape
     # each voxel's ball of points updates the voxel centers within `band` of the ball, one row along z at a
     # time
@@ -403,8 +403,8 @@ def points_lower_bound(scene, at):
 def near_point(scene, at, limit):
     """Approximate distance to the surface of the nearest point, at most `limit` [m], and its gradient.
 
-    It is the distance to the nearest of the points that the eight voxels around store, which is too large by
-    a few millimeters at most. It is used for gradients, where an exact search would take too long.
+    It is the distance to the nearest of the points stored in the eight voxels around `at`, which is too
+    large by a few millimeters at most. It is used for gradients, where an exact search would take too long.
     """
     best = limit
     gradient = _ZERO, _ZERO, _ZERO
