@@ -140,7 +140,8 @@ LIMITS = ("lower", "upper", "velocity", "acceleration")
 
 
 def robot_parts(robot: Robot) -> dict[str, str]:
-    """Hashes of everything in a robot that proofs depend on, except torques (`request_parts`)."""
+    """Hashes of everything in a robot that proofs depend on, except the inertias and effort limits, which
+    `request_parts` hashes."""
     parts = {
         "planned joints": _hash([robot.base, *robot.joint_names]),
         "allowed collisions": _hash(sorted(sorted(pair) for pair in robot.allowed_collisions)),

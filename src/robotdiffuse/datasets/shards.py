@@ -405,8 +405,8 @@ def check_shapes(folder: str | FilePath, shard: Shard, manifest: Manifest) -> No
 
 
 def check_shard(folder: str | FilePath, index: int, manifest: Manifest) -> Shard:
-    """Read a shard and check shapes, types, finite numbers and the fingerprint. Whether the values of `family`
-    and `goal_index` are valid indices is not checked.
+    """Read a shard and check shapes, types, finite numbers and the fingerprint. Whether the values of
+    `family` and `goal_index` are valid indices is not checked.
 
     Raises InputError for the first defect. It names the shard and, unless only the fingerprint is wrong, the
     array.

@@ -88,7 +88,8 @@ class SamplingSettings(Settings, name="sampling"):
     """Amount of new noise in each denoising step: 0 is DDIM, 1 is ancestral sampling. Ignored by the sampler
     ddpm, for which it is 1."""
     guided_share: Share = 0.5
-    """Share of the denoising steps that are guided; these are the last ones: 0 none, 1 all (the paper's)."""
+    """Share of the denoising steps, the last ones, that the `guide` of `MotionModel.sample` improves: 0 none,
+    1 all (the paper's)."""
     guidance_scale: float = 1.0
     """Scale of classifier-free guidance: 1 uses the network's prediction as it is, larger values strengthen
     the condition, 0 ignores it. Values other than 1 need weights that were trained with a condition_drop

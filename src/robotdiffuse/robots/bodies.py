@@ -14,7 +14,6 @@ from robotdiffuse.core.types import (
     GivenVector,
     Points,
     Pose,
-    Rotation,
     Value,
     Vector,
     frozen_dataclass,
@@ -112,7 +111,7 @@ class Inertia(NamedTuple):
     """Mass [kg]."""
     com: Vector
     """Center of mass [m]."""
-    moments: Rotation
+    moments: Float[ndarray, "3 3"]
     """Inertia matrix about the center of mass, along the frame's axes [kg m²]."""
 
     @property

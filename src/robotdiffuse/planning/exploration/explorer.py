@@ -133,8 +133,8 @@ class Stop:
 
 def braked(robot: Robot, motion: Trajectory, time: float) -> Trajectory:
     """The motion from `time` on, slowed to rest after as little of the path as the limits allow. It stays on
-    the path. If no braking that was tried keeps the limits, it is the rest of the motion. While the arm
-    brakes for b seconds, the clock of the motion advances by b / 2."""
+    the path. If no braking that was tried keeps the limits, the remaining motion is returned unchanged. While
+    the arm brakes for b seconds, the clock of the motion advances by b / 2."""
     used = motion.duration - time
     best = _rows(motion, time, max(used, LEAST_STEP), 0.0, RAMPS[0])
     for delay in np.arange(0.0, used, DELAY_STEP):
@@ -347,7 +347,7 @@ class Explorer:
         )
         step = Step(STUCK, "")
         for policy in policies:
-            # the strict policy need not enlarge points: the map does not call space within their error free
+            # the strict policy need not enlarge points: in the map, space within their error is not free
             enlarged = policy != STRICT
             shapes = point_shapes(points, self.robot, self.scene, q, goals, errors, enlarged)
             problem = Problem(self.robot, added(self.scene, shapes), q, self._goal)
@@ -374,8 +374,8 @@ class Explorer:
 
     @locked
     def stop(self, motion: Trajectory, time: float) -> Stop | None:
-        """End a motion under way early, if views observed since `next` returned it show an obstacle in its
-        way. After the stop, call `next` again.
+        """End a motion under way early, if an obstacle in its way was seen since `next` returned the motion.
+        After the stop, call `next` again.
 
         The stop is within the robot's limits of velocity, acceleration and jerk.
 
@@ -674,7 +674,7 @@ class Explorer:
         """The unknown voxels of the map, except voxels that the arm fills at the configurations `ends`."""
         lost = None
         if predicted is None:
-            # rays without a return lead there; a confidence without a prediction depends on it
+            # regions on rays without a return; a confidence without a prediction depends on them
             lost = np.pad(lost_regions(self._views.volume()), ((0, 0), (0, 0), (LAYERS_BELOW, 0)))
         return UnknownSpace(self.robot, ends, self.map.unknown, predicted, 0.0, MAP, lost)
 

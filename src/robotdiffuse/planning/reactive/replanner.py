@@ -178,8 +178,8 @@ class TimedPath:
         """The path's first and second derivatives on the grid, the grid of s, and the largest ṡ² on it."""
         count = max(int(self.line.length / LINE_INTERVAL), 8)
         grid = timing_grid(self.line, TimingSettings(line_intervals=count, corner_intervals=CORNER_INTERVALS))
-        # s̈ is constant in an interval, so an arm at rest in the last one could not start; it is divided until
-        # its last part is within the tolerance of `end`
+        # s̈ is constant in an interval, and ṡ is 0 at the path's end, so an arm at rest in the last interval
+        # could not start. This interval is divided until its last part is within the tolerance of `end`.
         parts = (grid[-1] - grid[-2]) * 0.5 ** np.arange(1, 26)
         grid = np.concatenate([grid[:-1], grid[-1] - parts, grid[-1:]])
         path = self.line(grid, 1), self.line(grid, 2), grid
@@ -222,8 +222,8 @@ GRID_TOLERANCE = 1e-4
 STILL = 1e-9
 """The arm rests if its last samples differ by less than this in each joint [rad]."""
 B_SPLINE = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
-"""Coefficients of the uniform cubic B-spline: a row for each power of u, the fraction of a step that has
-passed, and a column for each control point."""
+"""Coefficients of the uniform cubic B-spline: a row for each power of u, and a column for each control
+point. u is the fraction of a step that has passed."""
 
 
 class JerkFilter:
@@ -293,7 +293,8 @@ class JerkFilter:
         count = 1 if resting else int(np.ceil((motion.duration + self._ago) / step)) + window + 2
         times = step * np.arange(1, count + 1) - self._ago
         raw = np.concatenate([self._samples, path.positions(motion, times)])
-        # averages of the differences from the last sample, so that rounding does not move the motion's end
+        # averages of the differences from the last sample, so that rounding does not move the motion's end;
+        # `running_means` begins at the second row, after the row of zeros
         points = running_means(np.concatenate([0 * raw[:1], raw - raw[-1]]), window)
         # The first row is a fraction u of a step after a time of the grid. Rows of `powers`: powers of u, and
         # their first and second derivatives.
@@ -397,9 +398,8 @@ class PredictedObstacles:
         self, q: Configuration | Configurations, times: float | Values, rest_time: float
     ) -> float | None:
         """Time from which the covering spheres do not prove the arm free of the obstacles [s]; None if they
-        always do. The arm moves through the
-        configurations q at `times` [s] and then rests for `rest_time` [s]. With a single configuration and
-        time, it only rests, from this time on."""
+        always do. The arm moves through the configurations q at `times` [s] and then rests for `rest_time`
+        [s]. With a single configuration and time, it only rests, from this time on."""
         times = np.append(times, np.max(times) + rest_time) - self._since
         q = np.atleast_2d(q)
         first = self._collision.first_unproved_time(times, np.concatenate([q, q[-1:]]), 0.0)
@@ -564,8 +564,8 @@ class Replanner:
         Args:
             observation: For each observed obstacle, by name, T_base_obstacle [4, 4] or only the origin of its
                 frame [3]. An obstacle that is missing may be anywhere that it can have reached since it was
-                last seen; if it never was, since the first step, when it counts as seen where the problem
-                says.
+                last seen. One that was never observed counts as seen at the first step, at its pose in the
+                problem.
             now: Time of the observation [s]; it must grow from step to step.
 
         Returns:

@@ -93,7 +93,7 @@ class UrdfTree:
     """The links and joints of one URDF file or MuJoCo model, checked as they are read."""
 
     text: bytes
-    """The URDF, also of a xacro file or a MuJoCo model."""
+    """The URDF; for a xacro file or a MuJoCo model, the URDF that was made from it."""
 
     def __init__(self, path: Path, folders: dict[str, str | Path], compile_xacro: bool = False) -> None:
         """Read the file. `folders` are folders of ROS packages by name. If `compile_xacro` is true, a xacro
@@ -106,8 +106,8 @@ class UrdfTree:
         self.unlimited = set[str]()
         """Joints without a velocity limit."""
         self.unranged = set[str]()
-        """Joints without limits of position, such as wheels; they are planned only if `limits` of `robot`
-        gives position limits, and can be held at any value."""
+        """Joints without limits of position, such as wheels; they are planned only if the argument
+        `limits` of the method `robot` gives position limits, and can be held at any value."""
         self._surfaces: dict[str, tuple[Surface, ...]] = {}
 
         def parsed(text: bytes) -> ET.Element:
@@ -366,7 +366,7 @@ class UrdfTree:
         return joints
 
     def above(self, link: str) -> dict[str, Pose]:
-        """T_link_ancestor of each ancestor of a link that fixed joints alone connect to the link."""
+        """T_link_ancestor of each ancestor that fixed joints alone connect to the link."""
         transforms: dict[str, ndarray] = {}
         T_link_ancestor = np.eye(4)
         while link in self.parents:
@@ -460,7 +460,7 @@ class UrdfTree:
 
     def _with_limits(self, joint: Joint, attributes: dict[str, str]) -> Joint:
         stated = {name: text for name, text in attributes.items() if not _is_endless(text)}
-        # a position limit that stands for none voids the other one too
+        # an endless position limit, such as 1e16, voids the other one too
         ranged = joint.kind != "continuous" and {"lower", "upper"}.isdisjoint(attributes.keys() - stated)
         limits = {
             name: float(self._numbers(stated[name], 1, f"joint {joint.name}: {name} limit")[0])
@@ -549,9 +549,9 @@ class UrdfTree:
     def surfaces(self, link: str) -> tuple[Surface, ...]:
         """The link's elements of the tag `kind` as triangle meshes, in the link's frame.
 
-        Shapes whose sizes are all 0, as of Jaco and Atlas, are left out, with a note. Raises InputError for
-        elements without exactly one shape, unknown shapes, wrong sizes, scales and origins, and meshes that
-        are missing or damaged.
+        Shapes whose sizes are all 0, as in the URDFs of Jaco and Atlas, are left out, with a note. Raises
+        InputError for elements without exactly one shape, unknown shapes, wrong sizes, scales and origins,
+        and meshes that are missing or damaged.
         """
         if link in self._surfaces:
             return self._surfaces[link]
@@ -652,7 +652,7 @@ class UrdfTree:
 
 
 def _is_endless(limit: str) -> bool:
-    """Whether a limit is so large, such as 1e16 or inf, that it stands for none."""
+    """Whether a limit is so large, such as 1e16 or inf, that it means no limit."""
     with suppress(ValueError):
         return abs(float(limit)) > MAX_COORDINATE
     return False
@@ -712,7 +712,7 @@ def with_limits(robot: Robot, limits: Mapping[str, dict[str, float]]) -> Robot:
     for a lower limit above the upper one.
 
     A new velocity limit also sets the acceleration limit, and a new acceleration limit the jerk limit, in the
-    default ratios, unless these limits are given too, or were stated by the URDF. A continuous joint
+    default ratios, unless these limits are given too, or were in other ratios before. A continuous joint
     with a position limit becomes revolute; if only one of its limits is given, the other one is half a turn
     from zero.
     """
