@@ -12,7 +12,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.files import MEGABYTE
 from robotdiffuse.processes.workers import CLUSTERS
 
-# Exit statuses: done; no valid motion; bad input; the output could not be written; stopped by the user.
+# Exit statuses: done; no valid motion; bad input; the output could not be written.
 SOLVED = 0
 NO_PLAN = 1
 BAD_INPUT = 2
@@ -60,7 +60,7 @@ def check_workers(arguments: Namespace) -> None:
 
 
 def number(kind: type, fits: Callable[[Any], bool], what: str) -> Callable[[str], Any]:
-    """A function that reads a finite number for which `fits` holds. what: such a number, in messages."""
+    """A function that reads a finite number for which `fits` holds. what: what messages call it."""
 
     def read(text: str) -> Any:
         is_digits = text.isascii() and text.isdecimal()
@@ -128,7 +128,8 @@ def positives(text: str) -> list[float]:
 
 
 def address(text: str) -> tuple[str, int]:
-    """HOST or HOST:PORT. An IPv6 address with a port is in brackets; without, brackets are added."""
+    """HOST or HOST:PORT. An IPv6 address must be in brackets if a port follows; otherwise, missing brackets are
+    added."""
     host, colon, digits = text.rpartition(":")
     if colon and (":" not in host or host.endswith("]")):
         return filled(host), port(digits)

@@ -78,8 +78,8 @@ def add_notes(report: Report, notes: Sequence[str]) -> None:
 
 POSE = "rop_pose"
 JOINT = "rop_joint"
-"""Problem sets. A problem of the same name has the same scene and start in both; the goal is a pose (POSE) or
-one configuration (JOINT). Each set leaves out its own trivial problems."""
+"""Problem sets. A problem with the same number has the same scene and start in both; the goal is a pose
+(POSE) or one configuration (JOINT). Each set leaves out its own trivial problems."""
 GOALS = {POSE: "a pose with ten configurations", JOINT: "one configuration"}
 STREAM = 1_000
 """Part of the random seed, different from that of the families' held-out problems."""
@@ -212,8 +212,8 @@ The first four columns are the normalized figures:
 | MPD          | 0.454   | 0.133     | 1      | 1     | 0.6467   | 0.645   | +0.002     |
 | RobotDiffuse | 0.823   | 0.315     | 0.983  | 0.990 | 0.7774   | 0.765   | +0.012     |
 
-The order of the rows is as printed, except for RRT* and MPiNets, which have equal printed scores. The cause
-of the differences is unknown. These explanations were tried:
+These scores rank the rows as the printed scores do, except that RRT* and MPiNets have equal printed scores.
+The cause of the differences is unknown. These explanations were tried:
 
 - Rounding: four times each printed score has at most two decimals (1.67, 0.76, 1.67, 2.58, 3.06), so the
   normalized values were probably rounded to two decimals. This gives MPD exactly (0.645), and MPNet if

@@ -34,8 +34,8 @@ MIN_CELLS = 40
 MIN_AGREEMENT = 0.6
 """If at least this fraction of the arm's cells has the arm's depth, the camera is correct to centimeters."""
 MIN_NAMED = 0.4
-"""A mistake is named only if undoing it gives more than this fraction of the arm's cells the arm's depth. The
-fraction is below MIN_AGREEMENT, since objects in front of the arm may hide it."""
+"""A mistake is named only if, once it is undone, more than this fraction of the arm's cells have the arm's
+depth. The fraction is below MIN_AGREEMENT, since objects in front of the arm may hide it."""
 BETTER = 1.5
 """A mistake is named only if undoing it raises the agreement by at least this factor."""
 STANDS_OUT = 0.2
@@ -72,8 +72,8 @@ def _images(view: DepthView, robot: Robot, q: Configuration) -> tuple[Cells, Cel
 
 
 def _compared(cells: Cells, arm: Cells) -> tuple[float, float, int]:
-    """For the cells in which the model shows the arm: the fraction whose depth is the arm's, the fraction
-    that sees through the arm (larger depths), and the number of these cells."""
+    """For the cells in which the model shows the arm and the image has a depth: the fraction whose depth is
+    the arm's, the fraction that sees through the arm (larger depths), and the number of these cells."""
     compared = np.isfinite(arm) & (cells > 0)
     behind = cells[compared] - arm[compared] - SPHERES_AHEAD
     if not len(behind):

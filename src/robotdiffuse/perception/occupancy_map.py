@@ -137,7 +137,7 @@ LOST_WIDTH = 3
 ones, so it mistakes large ones for free space."""
 LOST_PROBABILITY = 0.15
 """Smallest probability that a voxel of a lost region is occupied. Behind obstacles that gave no return it was
-0.18 on average, behind a hand before the lens 0.03 to 0.07."""
+0.18 on average; behind a hand in front of the lens, it was 0.03 to 0.07."""
 
 
 def lost_regions(volume: ObservedVolume) -> Voxels:
@@ -289,7 +289,7 @@ APPEARED_PADDING = 0.05
 """Radius of points that appear in space that was free before [m]: only the front of their object is seen."""
 MIN_APPEARED = 12
 """An object appears only if a view has points in at least this many voxels that are deep in free space; in
-simulations with noise and inexact poses, errors filled up to 4."""
+simulations with noise and inexact poses, errors put points into at most 4 such voxels."""
 COVER_RADIUS = MAP.edge * 3**0.5 / 2
 """Radius of the ball around a voxel's center that covers the voxel [m]."""
 
@@ -554,8 +554,9 @@ class ViewMemory:
         return merged([memory.volume for memory in self._memories])
 
     def points(self, free: Voxels) -> tuple[Points, PointErrors]:
-        """The mean of the kept views' points in each cell of a grid, where a view has one point (see
-        `seen_points`) [m]; and the errors of each mean, the largest of its points (see `point_errors`).
+        """The mean of the kept views' points in each cell of a grid [m], and the errors of each mean, the
+        largest of its points (see `point_errors`). A view has at most one point in a cell (see
+        `seen_points`).
 
         Stray points are left out: points in free voxels of the map (`free`), through which other views saw,
         and, in noisy images, points of a single view without another point nearby, because a surface gives

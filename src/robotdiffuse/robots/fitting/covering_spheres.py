@@ -39,10 +39,10 @@ def cover(mesh: ConvexMesh) -> Spheres:
     vertices = mesh.vertices @ axes.T
     low = vertices.min(axis=0)
     high = vertices.max(axis=0)
-    inradius = float((high - low).min()) / 2
-    tolerance = LINK_TOLERANCES.tolerance(*HAND, inradius)
+    half_width = float((high - low).min()) / 2  # at least the radius of the largest inscribed sphere
+    tolerance = LINK_TOLERANCES.tolerance(*HAND, half_width)
     bounding = _around(vertices)
-    if bounding[3] - inradius <= tolerance:
+    if bounding[3] - half_width <= tolerance:
         spheres = bounding[None]
     else:
         pieces = [vertices]
