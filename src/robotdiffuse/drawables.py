@@ -83,7 +83,7 @@ def creased(vertices: Points, faces: Int[ndarray, "f 3"], colors: Float[ndarray,
     """A surface that is shaded smoothly except across sharp edges (CREASE_ANGLE), where vertices are
     duplicated so that each side has a normal of its own. colors: a color per face, 0 to 1."""
     triangles = vertices[faces]
-    # normals of the faces: of twice the face's area in length, and of length 1
+    # normals of the faces: the length of `scaled` is twice the face's area, that of `unit` is 1
     scaled = scaled_normals(triangles)
     unit = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-12)
     # the corners of all faces, sorted by their vertex (`owner`)

@@ -1,4 +1,4 @@
-"""Bounds of clearances and displacements over stretches (intervals) of a motion, of which proofs consist.
+"""The bounds that proofs consist of: clearances and displacements over stretches (intervals) of a motion.
 
 A claim is that a link is free of the scene or of another link. A stretch is free for a claim if the clearance
 of the link in the middle of the stretch exceeds its displacement: the largest distance of any point of the
@@ -96,8 +96,9 @@ class Surface:
         return [(KDTree(middles[rows]), rows, float(sizes[rows].max())) for rows in members]
 
     def distances(self, points: Points) -> Values:
-        """Lower bounds of the distances of points to the surface [m], at most CLEARANCE_CAP: exact for near
-        triangles and for points; distances to balls around the triangles for others."""
+        """Lower bounds of the distances of points to the surface [m], at most CLEARANCE_CAP. They are exact
+        if the elements are points, and for near triangles; farther triangles are replaced by balls around
+        them."""
         nearest = np.full(len(points), CLEARANCE_CAP)
         for tree, rows, size in self._groups:
             to_middle = tree.query(points)[0]
@@ -199,8 +200,8 @@ def _to_triangles(p: Points, triangles: Float[ndarray, "n 3 3"]) -> Values:
     to the nearest edge."""
     a, b, c = np.moveaxis(triangles, 1, 0)
     normal = np.cross(b - a, c - a)
-    area = np.sqrt((normal**2).sum(axis=1))
-    within = area > 0
+    normal_length = np.sqrt((normal**2).sum(axis=1))
+    within = normal_length > 0
     distance = np.full(len(p), np.inf)
     for start, stop in ((a, b), (b, c), (c, a)):
         edge = stop - start
@@ -209,7 +210,7 @@ def _to_triangles(p: Points, triangles: Float[ndarray, "n 3 3"]) -> Values:
         length2 = np.maximum((edge**2).sum(axis=1), 1e-300)
         share = np.clip((edge * out).sum(axis=1) / length2, 0.0, 1.0)
         distance = np.minimum(distance, np.sqrt(((out - share[:, None] * edge) ** 2).sum(axis=1)))
-    height = np.abs(((p - a) * normal).sum(axis=1)) / np.where(area > 0, area, 1.0)
+    height = np.abs(((p - a) * normal).sum(axis=1)) / np.where(normal_length > 0, normal_length, 1.0)
     return np.where(within, np.minimum(height, distance), distance)
 
 
@@ -459,8 +460,8 @@ class Prover:
         return clearance, displacement + other_displacement
 
     def _to_links(self, postures: Postures, at: ndarray, centers: ndarray, link: ndarray) -> ndarray:
-        """The distance of each point to the spheres of its link [m]. at: the posture; link: the link's
-        index."""
+        """The distance of each point to the spheres of the link that it is checked against [m]. at: the
+        posture; link: the index of that link."""
         distances = np.empty(len(at))
         step = MAX_ARRAY_SIZE // 64
         for first in range(0, len(at), step):
@@ -574,7 +575,7 @@ def placed(parts: tuple[Part, ...], T: Pose) -> list[Part]:
 
 
 def _balls(robot: Robot, link: str) -> Float[ndarray, "n 4"]:
-    """The spheres that cover a link; one sphere around its meshes if it has none."""
+    """The spheres that cover a link; if it has no spheres, one sphere around its meshes."""
     spheres = robot.spheres.get(link, np.zeros((0, 4)))
     meshes = robot.meshes.get(link)
     if len(spheres) or not meshes:

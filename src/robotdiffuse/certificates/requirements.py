@@ -8,7 +8,7 @@ where L_m is an upper bound on the distance of p from the axis of joint m during
 point to a convex body is a convex function. So along the chord, this distance is at most the larger of its
 values at the two ends; the deviation is added. An axis of the frame deviates from its own chord by at most
 (sum_j |dq_j|)² / 8. On a Cartesian line, the angle between the frame and its interpolated orientation
-changes at most at the sum of their speeds of rotation.
+changes no faster than the sum of their speeds of rotation.
 
 Torques are computed at samples: the rows of the motion and places between them. Between two samples,
 positions follow a cubic or a straight line, and velocities and accelerations are its derivatives.

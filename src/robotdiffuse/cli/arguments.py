@@ -128,8 +128,8 @@ def positives(text: str) -> list[float]:
 
 
 def address(text: str) -> tuple[str, int]:
-    """HOST or HOST:PORT. An IPv6 address must be in brackets if a port follows; otherwise, missing brackets are
-    added."""
+    """HOST or HOST:PORT. An IPv6 address must be in brackets if a port follows; otherwise, missing brackets
+    are added."""
     host, colon, digits = text.rpartition(":")
     if colon and (":" not in host or host.endswith("]")):
         return filled(host), port(digits)

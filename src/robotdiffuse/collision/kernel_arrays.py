@@ -66,7 +66,7 @@ class RobotArrays(NamedTuple):
     """[groups, 4] a sphere around all spheres of the group."""
     pairs: ndarray
     """[pairs, 4] two groups that are checked against each other; the table in `pair_tables` for this pair, -1
-    if there is none; and the bit that this pair has in each cell of that table, as an integer."""
+    if there is none; and the bit of this pair in the cells of that table, as a power of two."""
     pair_tables: ndarray
     """[tables, ...] joint values at which pairs may touch: see `sphere_pair_tables.py`."""
     parents: ndarray | None
@@ -128,7 +128,7 @@ def compile_robot(robot: Robot) -> RobotArrays:
         offsets=np.ascontiguousarray(offsets, np.float32),
         spheres=np.concatenate([NO_SPHERES, *spheres]).astype(np.float32),
         first=np.cumsum([0, *map(len, spheres)]).astype(np.int32),
-        # NO_SPHERES adds no row; it makes the array of a robot without spheres
+        # NO_SPHERES adds no row; it gives concatenate a part even if the robot has no spheres
         rows=np.concatenate([by_sixteen(row, row[-1:]) for row in [NO_SPHERES, *rows]]),
         row_bounds=np.array(
             [row for link_rows in placed_groups for row in link_rows.row_bounds], np.float32

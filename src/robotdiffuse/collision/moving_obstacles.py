@@ -71,8 +71,8 @@ class MovingCollision:
     def __init__(
         self, robot: Robot, moving: Sequence[MovingObstacle], contact: float, tightness: float
     ) -> None:
-        """Meshes nearer than `contact` [m] count as touching. Intervals are halved until each lower bound is
-        at least the fraction `tightness`, in [0, 1), of the smallest clearance measured."""
+        """Meshes nearer than `contact` [m] count as touching. Intervals are halved until the lower bound on
+        the clearance in each is at least `tightness`, in [0, 1), times the smallest clearance measured."""
         self.robot, self.moving, self.contact, self.tightness = robot, tuple(moving), contact, tightness
         self.link_names, self.links = compile_links(robot)
         self.tracks = compile_tracks(self.moving)
@@ -97,7 +97,7 @@ class MovingCollision:
                     continue
                 time = (start + stop) / 2
                 distance = self._distance(link, o, times, q, time)
-                # an interval of one time is proved by the distance alone
+                # an interval of length 0 is proved by the distance alone
                 if distance <= self.contact or 0 < stop - start < MIN_INTERVAL:
                     if hit is None or time < hit[0]:
                         hit = time, link, o
@@ -197,7 +197,7 @@ def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
 
 def compile_tracks(moving: Sequence[MovingObstacle]) -> Tracks:
     """The arrays of moving obstacles for compiled code. A mesh is represented by its bounding box."""
-    # times, positions, quaternions and speeds of each obstacle, after those of none
+    # times, positions, quaternions and speeds of each obstacle; the first entry is empty, for no obstacle
     tracks = [(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0))]
     solids = list[Solid]()
     for obstacle in moving:
@@ -205,8 +205,8 @@ def compile_tracks(moving: Sequence[MovingObstacle]) -> Tracks:
         quaternions = np.stack([quaternion_from_rotation(T) for T in poses])
         for i in range(1, len(quaternions)):
             quaternions[i] *= 1.0 if quaternions[i] @ quaternions[i - 1] >= 0 else -1.0
-        track_ends = np.append(track_speeds(at, poses, obstacle.radius), 0.0)
-        tracks.append((at, poses[:, :3, 3], quaternions, track_ends))
+        speeds = np.append(track_speeds(at, poses, obstacle.radius), 0.0)
+        tracks.append((at, poses[:, :3, 3], quaternions, speeds))
         solids += solids_of(Scene([obstacle.shape]))
     boxes = [
         inverse(obstacle.shape.T_base_shape) @ solid.T_base_box

@@ -26,7 +26,7 @@ JOIN_VOXEL = 0.004
 EXACT_RANGE = 0.1
 """Clearances to points are exact up to this [m], and lower bounds beyond."""
 VOXELS_PER_RANGE = 10
-"""The grid stores nearest points up to a distance of this many voxels, or fewer if MAX_VOXELS requires larger
+"""The grid stores nearby points up to a distance of this many voxels, or fewer if MAX_VOXELS requires larger
 voxels."""
 MAX_VOXELS = 1e6
 """Approximate largest number of voxels of a grid: 4 MB, which fits a processor's cache."""
@@ -124,7 +124,8 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> tuple[ndarray, ..
     index = index[order]
     cell = cell[order]
     first = np.asarray(np.searchsorted(cell, np.arange(int(np.prod(cells)) + 1)), np.int32)
-    # distance up to which the grid is exact [m], enough to decide whether the largest sphere touches a point
+    # up to `band` [m], stored distances are exact, which decides whether the largest sphere touches a point;
+    # beyond it they are lower bounds, and queries compute exact distances up to `exact_distance`
     band = np.float32(max(radius + float(radii.max()) + 1e-3, 2 * float(voxel)))
     # runs of points in the same voxel
     voxels = np.ravel_multi_index(index.T, shape.tolist())

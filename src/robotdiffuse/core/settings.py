@@ -1,7 +1,7 @@
 """Settings: frozen dataclasses with bounds in their field types, readable from JSON and from NAME=VALUE.
 
     @dataclass(frozen=True)
-    class RRTConnectSettings(Settings, name="rrt_connect"):
+    class MyPlannerSettings(Settings, name="my_planner"):
         step: Positive = 1.0
         \"\"\"Longest extension of a tree [rad, joint-space L2].\"\"\"
         sampler: Annotated[str, OneOf(SAMPLERS)] = "uniform"
@@ -91,7 +91,7 @@ class Filled:
 @dataclass(frozen=True)
 class SettingsOf:
     """The value must be the settings of a registry entry. Another field holds the name of this entry: the
-    mark of `denoiser_settings` has the field "denoiser" and the registry of denoisers.
+    type of `denoiser_settings` is annotated with SettingsOf("denoiser", DENOISERS).
 
     The value is None if the other field does not hold a name in the registry, but for example a folder.
     """

@@ -128,8 +128,8 @@ def fill_clouds(kinds, params, seeds, region, out):
             else:
                 # The point (u, v) on one of the six faces: the offset of `pick` within the area of the box
                 # chooses a pair of opposite faces, and the lowest bit of x one of the two. The columns of
-                # `axes` are the edges of the box: `face` is normal to the pair, and the indices face - 1 and
-                # face - 2, of which negative ones count from the end, are the other two.
+                # `axes` are the edges of the box. Column `face` is normal to the pair; columns face - 1 and
+                # face - 2 are the other two edges (negative indices count from the end).
                 offset = pick - (ends[j - 1] if j > 0 else _ZERO)
                 side = _HALF if x & np.uint64(1) else -_HALF
                 face = int(offset >= faces[j, 0]) + int(offset >= faces[j, 1])

@@ -139,7 +139,7 @@ RUNS_PER_TASK = 20
 """Number of runs in a task of a cluster. Each task starts the planner's process again."""
 
 
-# A record reads the files of the problem's shapes and views; a problem is planned many times.
+# cached: making a record reads the files of shapes and views, and a problem is planned many times
 _record_of = lru_cache(maxsize=8)(problem_record)
 
 
@@ -471,6 +471,7 @@ def _note_session(settings: BenchSettings, sessions: JsonLines) -> str:
         "workers": settings.cluster or settings.workers,
         "load": load_average(),
         "equal_time": settings.equal_time,
+        "cpu_time": settings.cpu_time,
     }
     sessions.append(note)
     return session

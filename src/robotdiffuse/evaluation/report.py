@@ -1,6 +1,6 @@
 """A report: texts, tables and plots, written as Markdown or as an HTML page that works offline.
 
-Plots are SVG. They need matplotlib, and pages markdown-it-py, which are not part of the core install.
+Plots are SVG and need matplotlib. HTML pages need markdown-it-py. Neither is part of the core install.
 """
 
 import html

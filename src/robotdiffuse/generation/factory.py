@@ -154,7 +154,7 @@ class GenerationSettings(Settings):
 
 MAX_PROBLEMS_PER_ROW = 50
 EXTRA_PROBLEMS = 1_000
-"""A shard with n rows fails after MAX_PROBLEMS_PER_ROW n + EXTRA_PROBLEMS problems."""
+"""A shard with n rows fails after MAX_PROBLEMS_PER_ROW * n + EXTRA_PROBLEMS problems."""
 PROBLEMS_PER_SHARD = 2**32
 """Problem numbers reserved for each shard, so that no two shards contain the same problem."""
 

@@ -67,9 +67,9 @@ def checked_motion(
     """The motion with these parts, after checking them.
 
     Empty times, velocities and accelerations count as absent. If there are several rows and all their times
-    are 0, the times count as absent too. Without times, velocities and accelerations are left out. Times are
-    shifted to begin at 0. Raises InputError as `check_motion_arrays` does, and for times that do not
-    increase.
+    are 0, the times count as absent too. If there are no times, the velocities and accelerations are left
+    out. Times are shifted to begin at 0. Raises InputError as `check_motion_arrays` does, and for times that
+    do not increase.
     """
     optional_fields = {"times": times, "velocities": velocities, "accelerations": accelerations}
     arrays = {name: value for name, value in optional_fields.items() if not _empty(value)}

@@ -63,7 +63,7 @@ MAX_CLOUD_HEIGHT = 240
 @no_type_check
 @frozen_dataclass
 class DepthView(Value):
-    """A depth image of a pinhole camera, in the frame of the robot's base.
+    """A depth image of a pinhole camera, with the camera's pose in the frame of the robot's base.
 
     A pixel without a return (less than 0.05, such as 0, or NaN) says nothing: its ray may be free or
     occupied. A pixel of +inf, or above 1e4, means that nothing is within the camera's range (as in ROS, REP
@@ -160,7 +160,7 @@ class DepthView(Value):
             T: The rigid motion, a homogeneous transform [4, 4].
 
         Returns:
-            The view after the motion; of a view of a cloud file, `source` is None.
+            The view after the motion. If it was made from a cloud, its `source` is None.
 
         Raises:
             InputError: Unless T is rigid.
@@ -180,8 +180,8 @@ class DepthView(Value):
     ) -> "DepthView":
         """Make the depth image that a camera would take of a point cloud.
 
-        Each pixel holds its nearest point. The image covers the cloud, and its pixels are large enough that
-        most of them contain points. Points behind the camera are ignored.
+        Each pixel holds its nearest point. The image covers the cloud except for outliers, and its pixels are
+        large enough that most of them contain points. Points behind the camera are ignored.
 
         Args:
             points: The cloud [n, 3] in the frame of the base [m].

@@ -260,7 +260,7 @@ class Workspace:
 
     @property
     def T_world_base(self) -> ndarray:
-        """Pose of the base in the world. If it is set, obstacles stay where they are in the world."""
+        """Pose of the base in the world. If a new pose is assigned, obstacles stay in place in the world."""
         return self._T_world_base
 
     @T_world_base.setter
@@ -475,7 +475,7 @@ class Workspace:
         """Plan steps such as approach, grasp, lift, carry and place. The workspace is not changed.
 
         If a step fails, the last `MoveTo` step before it that has an untried goal or goal configuration is
-        planned again to that end.
+        planned again, to this goal or configuration.
 
         Args:
             steps: `rd.MoveTo`, `rd.MoveRelative`, `rd.Attach` and `rd.Detach`, in their order.
@@ -497,8 +497,8 @@ class Workspace:
             >>> space.plan_steps(steps, "ready").solved
             True
         """
-        # The search is depth-first: if a step fails, the last `MoveTo` step before it that has another end is
-        # planned again to that end.
+        # The search is depth-first: if a step fails, the last `MoveTo` step before it that has another end
+        # configuration is planned again to this configuration.
         began = clock()
         space = self
         check_type("steps", steps, (list, tuple), "a list of steps")

@@ -26,9 +26,9 @@ ADVICE = "lengths are in meters: divide millimeters by 1000"
 
 
 def unit_notes(problem: Problem) -> tuple[str, ...]:
-    """Notes on obstacles and views that may be in millimeters: one on each that is too large (for views, also
-    too far away), or, for views, whose intrinsics may be those of an image of another size. If there is no
-    such note, no view and no moving obstacle: one on all obstacles if none is in reach."""
+    """Notes on numbers that may be wrong: one on each obstacle that is too large, and on each view that is
+    too large, too far away, or has intrinsics that may be those of an image of another size. If there is no such
+    note, no view and no moving obstacle: one on all obstacles if none is in reach."""
     reach = reach_bound(problem.robot)
     obstacles = [
         shape for shape in problem.scene.shapes if not isinstance(shape, (SeenPoints, AssumedPoints))

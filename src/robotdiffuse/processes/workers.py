@@ -38,8 +38,8 @@ Function = Callable[..., Any]
 """A function that other processes can import: of a module, or a method of an object that can be pickled."""
 Results = Generator[tuple[int, Any], None, None]
 """Results in order of completion, each with the index of its call. After it is closed, the generator submits
-no more calls. Calls that run are stopped with their processes or with the cluster that was connected for
-them."""
+no more calls. Running calls stop when their processes end, or when the connection to a cluster ends that
+was made for these calls."""
 TERMINATE_TIMEOUT = 5.0
 """Time from asking a process to end until it is killed [s]."""
 PREPARE_TIMEOUT = 600.0

@@ -12,7 +12,7 @@ from robotdiffuse.robots.bodies import ConvexMesh, polygon_around_circle
 from robotdiffuse.robots.fitting.convex_parts import Surface, convex_hull, convex_parts
 
 SPHERE_RINGS = 7
-"""Number of rings of vertices on a sphere, and on a capsule's caps together."""
+"""Number of rings of vertices on a sphere. A capsule has one more, since both caps have the equator."""
 
 
 def capsule_polyhedron(radius: float, height: float) -> ConvexMesh:

@@ -48,8 +48,8 @@ class VerifySettings(Settings, name="verify"):
     may also differ by this fraction of its limit from the velocity that the positions give, from the
     problem's `start_velocity` (or zero) at the start, and from zero at the end."""
     rate_agreement: NotNegative = 0.5
-    """How far a row's acceleration may be outside of the interval between those that the cubics before and
-    after it have there, as a fraction of the joint's greatest acceleration."""
+    """How far a row's acceleration may be outside of the range between the accelerations of the two cubics
+    that meet at the row, as a fraction of the joint's greatest acceleration."""
     jump: Positive = 1.5
     """A step between rows is a jump if a joint's mean velocity exceeds its velocity limit by this factor."""
     chord: Positive = 1e-3

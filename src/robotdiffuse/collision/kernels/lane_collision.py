@@ -155,7 +155,7 @@ def _touching(centers, radius, solid):
 
 @allocation_free(forceinline=True)
 def placed(frame, p):
-    """Position in the base frame of the point p of a frame[12]. The coordinates may be those of 16 points."""
+    """Position in the base frame of point p of a frame (12 numbers); p may be coordinates of 16 points."""
     return dot(frame, p) + frame[9], dot(frame[3:], p) + frame[10], dot(frame[6:], p) + frame[11]
 
 

@@ -187,7 +187,7 @@ class AnytimeSearch:
         self.motions: TimeOptimization | None = None
         """Candidates for the fastest motion, if the objective is time."""
         self._lengths = list[tuple[int, float]]()
-        """Number of iterations and length, each time that the best length fell."""
+        """Number of iterations and length, each time that a path became the best."""
         self._untightened = False
         """Whether the best path is the first one and not tightened; `improve` tightens it."""
         self._shortens = True
@@ -295,7 +295,8 @@ class AnytimeSearch:
         """Judge whether more iterations are likely to shorten the best path.
 
         Args:
-            gain: Smallest fraction by which the last doubling of their number must have shortened it.
+            gain: Smallest fraction by which the last doubling of the number of iterations must have shortened
+                the best path.
             patience: Number of iterations before which the answer is yes.
 
         Returns:

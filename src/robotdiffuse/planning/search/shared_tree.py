@@ -301,7 +301,7 @@ class SharedTreeSettings(Settings, name="shared_tree_rrt_star"):
     """Largest number of rounds."""
     improvement: NotNegative = 0.005
     """The search ends when the best cost fell by less than this fraction in the last `patience` rounds. 0:
-    only `rounds`, the caller or a straight path ends a search, even if there is no path."""
+    only `rounds`, the caller or a straight path ends a search; without a path, it does not give up early."""
     patience: Count = 20
     """Number of rounds over which `improvement` is measured."""
 
