@@ -160,7 +160,7 @@ class Drawable:
 
 def drawables(scene: Scene, moving: Sequence[MovingObstacle] = ()) -> list[Drawable]:
     """All obstacles, the moving ones last."""
-    shapes = [(shape, None) for shape in scene.shapes] + [(obstacle.shape, obstacle) for obstacle in moving]
+    shapes = [(shape, None) for shape in scene.shapes] + [(obstacle.at(0.0), obstacle) for obstacle in moving]
     return [
         Drawable(shape, _color(shape, OBSTACLES[i % len(OBSTACLES)]), obstacle)
         for i, (shape, obstacle) in enumerate(shapes)

@@ -138,6 +138,7 @@ def test_bad_input(tmp_path: Path) -> None:
     refuses("qpos is 'ready'; it must be 9 numbers", planner().plan_pose, [0.5, 0, 0.4, *DOWN], "ready")
     for size in (7, 9):
         refuses("qpos is .*nan.*; it must be 9 numbers", planner().plan_pose, [0.5, 0, 0.4, *DOWN], np.full(size, np.nan))
+    refuses("qpos: locked: panda_finger_joint1 is 0.2", planner().plan_qpos, [QPOS], [*QPOS[:7], 0.2, 0.2])
     refuses("unknown option 'tim_step'.*did you mean time_step", planner().plan_pose, [0.5, 0, 0.4, *DOWN], QPOS, tim_step=1)
     for call, goal in ((planner().plan_pose, POSE), (planner().plan_screw, POSE), (planner().plan_qpos, [QPOS])):
         refuses("planning_time is -1; it must be a number from", call, goal, QPOS, planning_time=-1)

@@ -184,6 +184,17 @@ def test_intervals_are_over_problems_not_over_their_seeds(tmp_path: Path) -> Non
     assert str(row.success) == str(bench_report.success_in("rop", row)) == "100.0 (43.9 to 100.0)"  # of three
 
 
+def test_a_run_without_a_count_has_the_families_default_count(tmp_path: Path) -> None:
+    """Regression: problems beyond it counted, too, if a shorter run had solved them early."""
+    names = [f"rop/{i}" for i in range(bench_comparisons.FAMILY_COUNT + 40)]
+    records = [solved("mpd", name, 0.1, [(0.01, 2.0)]) for name in names[::2]]
+    records += [failed("mpd", name, 0.1, 0.1) for name in names[1::2]]
+    records += [failed("mpd", name, 1.0, 1.0) for name in names[: bench_comparisons.FAMILY_COUNT][1::2]]
+    folder = write(tmp_path / "run", records, {0.1: len(names)})
+    sections = bench_comparisons.sections(bench_comparisons.read_bench(folder), [1.0])
+    assert sections[0].comparisons[0].problems == bench_comparisons.FAMILY_COUNT
+
+
 def test_curves_end_where_they_are_no_longer_known_of_all_problems(small: Path) -> None:
     whole, _ = bench_comparisons.sections(bench_comparisons.read_bench(small))
     curves = {curve.planner: curve for curve in whole.curves}

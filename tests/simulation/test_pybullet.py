@@ -200,7 +200,8 @@ def test_distances_agree_with_coal(name: str, locked: dict[str, float]) -> None:
     with PyBulletOracle(robot, scene) as oracle:
         for q in np.random.default_rng(0).uniform(robot.lower, robot.upper, (40, robot.dof)):
             right = min(d.distance for d in (*exact.link_distances(q), *exact.pair_distances(q)))
-            assert oracle.distance(q) == pytest.approx(right, abs=TOLERANCE)
+            assert oracle.distance(q.tolist()) == pytest.approx(right, abs=TOLERANCE)
+        refuses("q is", oracle.distance, q * np.nan)
 
 
 def test_collisions_agree_with_coal_meshes_included() -> None:

@@ -54,6 +54,16 @@ def test_a_wall_that_the_arm_passes_is_not_hidden_behind_the_arm():
     assert (in_front > arm).sum() > 0.8 * (in_front > 0).sum()
 
 
+def test_the_traces_of_all_motions_are_in_the_picture(arm):
+    """Regression: the picture was framed for the first motion alone."""
+    start = np.zeros(arm.dof)
+    motions = [Path(arm.joint_names, np.array([start, end])) for end in (start + 0.1, start + 2 * np.eye(arm.dof)[0])]
+    trace = DrawnArm(arm).trace(motions[1].positions)
+    camera = view_of_motion(DrawnArm(arm), [], motions[0].positions, (320, 200), MARGINS, traces=[trace])
+    x, y, _ = camera.project(trace).T
+    assert (x > 0).all() and (x < 320).all() and (y > 0).all() and (y < 200).all()
+
+
 def test_several_motions_have_traces_of_their_own_colors(arm, motion, tmp_path):
     back = Path(arm.joint_names, motion.positions[::-1].copy() * 0.7)
     few = replace(SMALL, ghosts=0)

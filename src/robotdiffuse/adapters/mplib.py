@@ -434,7 +434,8 @@ class Planner:
             for joint in robot.joints
             if joint.name in robot.locked and joint.name in values and joint.mimic is None
         }
-        self.workspace.robot = robot.with_locked(locked)
+        with located("qpos"):
+            self.workspace.robot = robot.with_locked(locked)
         return q[self._places]
 
     def _qpos(self, q: ndarray, start_qpos: ArrayLike) -> ndarray:

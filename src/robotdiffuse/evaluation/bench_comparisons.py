@@ -28,6 +28,8 @@ from robotdiffuse.evaluation.report import share_cell
 from robotdiffuse.evaluation.runs import (
     CRASHED,
     ENDED_EARLY,
+    FAMILY_COUNT,
+    NONTRIVIAL_SUFFIX,
     OVERRAN,
     RAISED,
     RESTARTED,
@@ -556,8 +558,9 @@ def _counted(
     }
     if len(counted) == len(calls):
         return counted
+    family = problem_set.removesuffix(NONTRIVIAL_SUFFIX) in FAMILIES
     counts = [
-        (run["seeds"], run["count"] or len(places))
+        (run["seeds"], run["count"] or (FAMILY_COUNT if family else len(places)))
         for run in bench.sessions
         if plain_name(planner) in run["planners"]
         and problem_set in run["problems"]

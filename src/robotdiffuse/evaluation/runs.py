@@ -63,6 +63,8 @@ NONTRIVIAL_SUFFIX = "_nontrivial"
 does not."""
 SEARCH_TIME = 10.0
 """A problem is left out of such a set if the search does not solve it in this time [s]."""
+FAMILY_COUNT = 100
+"""Number of problems of a family if none is given."""
 REFERENCE_ITERATIONS = 20_000
 """Minimum number of iterations of the search for the reference length."""
 
@@ -139,7 +141,7 @@ def _set(text: str, count: int | None, folder: FilePath, report: Progress) -> li
     case_store = case_file(folder, family if family in FAMILIES else name)
     if family in FAMILIES:
         finder = search if family != text else None
-        return _of_set(case_store.held_out(family, count or 100, validator, finder, report), name)
+        return _of_set(case_store.held_out(family, count or FAMILY_COUNT, validator, finder, report), name)
     place = FilePath(text)
     check_not_input(folder.parent, text)
     source = folder / f"{name}.source.json"

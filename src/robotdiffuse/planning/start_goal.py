@@ -442,7 +442,9 @@ def _pose_goals(
         if note:
             context.note(note)
         return _with_turns(context, configurations)
-    places = [", ".join(f"{value:.3f}" for value in pose.T_base_frame[:3, 3]) for pose in poses_of(goal)]
+    base = np.eye(4) if problem.T_world_base is None else problem.T_world_base
+    in_world = [(base @ pose.T_base_frame)[:3, 3] for pose in poses_of(goal)]  # as in files and workspaces
+    places = [", ".join(f"{value:.3f}" for value in xyz) for xyz in in_world]
     place_of = {pose.frame: f"({xyz}) m" for pose, xyz in zip(poses_of(goal), places, strict=True)}
     of_poses = "the pose of " + " and of ".join(f"{frame} at {place}" for frame, place in place_of.items())
     unconstrained = replace(problem, constraints=())

@@ -686,6 +686,9 @@ class Problem(Value):
 
         rows = configurations(self.robot, q)
         checker = CollisionChecker(self.robot, self.scene)
+        pairs = checker.robot_arrays.pairs.copy()
+        pairs[:, 2] = -1  # tables of pairs tell no distances
+        checker.robot_arrays = checker.robot_arrays._replace(pairs=pairs)
         batch = np.atleast_2d(rows)
         each = np.hstack([checker.link_clearances(batch), checker.pair_clearances(batch)])
         clearances = each.min(axis=1, initial=1.0).astype(np.float64)

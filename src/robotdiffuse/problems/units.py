@@ -27,8 +27,8 @@ ADVICE = "lengths are in meters: divide millimeters by 1000"
 
 def unit_notes(problem: Problem) -> tuple[str, ...]:
     """Notes on numbers that may be wrong: one on each obstacle that is too large, and on each view that is
-    too large, too far away, or has intrinsics that may be those of an image of another size. If there is no such
-    note, no view and no moving obstacle: one on all obstacles if none is in reach."""
+    too large, too far away, or has intrinsics that may be those of an image of another size. If there is no
+    such note, no view and no moving obstacle: one on all obstacles if none is in reach."""
     reach = reach_bound(problem.robot)
     obstacles = [
         shape for shape in problem.scene.shapes if not isinstance(shape, (SeenPoints, AssumedPoints))

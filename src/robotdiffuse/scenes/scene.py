@@ -499,9 +499,8 @@ class MovingObstacle(Value):
     @cached_property
     def radius(self) -> float:
         """Upper bound on the distance of the shape's points from the origin of its frame [m]."""
-        low, high = self.shape.bounds
-        center = self.shape.T_base_shape[:3, 3]
-        return float(np.linalg.norm(np.maximum(np.abs(low - center), np.abs(high - center))))
+        low, high = self.shape.moved(inverse(self.shape.T_base_shape)).bounds
+        return float(np.linalg.norm(np.maximum(np.abs(low), np.abs(high))))
 
     @cached_property
     def track(self) -> tuple[Values, Poses]:

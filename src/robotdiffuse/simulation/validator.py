@@ -8,9 +8,11 @@ which is subtracted here; the remaining difference to exact distances is below 1
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Configuration, Configurations, Path
+from robotdiffuse.core.types import Configurations, Path
+from robotdiffuse.robots.robot import configurations
 from robotdiffuse.simulation.world import World
 from robotdiffuse.validation.tolerances import sample_path
 
@@ -40,10 +42,10 @@ class PyBulletOracle(World):
     faster than a new oracle.
     """
 
-    def nearest(self, q: Configuration, within: float = MAX_DISTANCE) -> OracleContact | None:
+    def nearest(self, q: ArrayLike, within: float = MAX_DISTANCE) -> OracleContact | None:
         """The closest pair of a link and an obstacle, or of two links; None if its distance exceeds `within`
         [m]."""
-        self.place(q)
+        self.place(configurations(self.robot, q))
         candidates = [
             (link, name, body, -1)
             for link in self.moving
@@ -60,12 +62,12 @@ class PyBulletOracle(World):
                 best = OracleContact(link, partner, distance)
         return best
 
-    def distance(self, q: Configuration) -> float:
+    def distance(self, q: ArrayLike) -> float:
         """The smallest signed distance to the scene or between links [m], at most MAX_DISTANCE."""
         nearest = self.nearest(q)
         return MAX_DISTANCE if nearest is None else nearest.distance
 
-    def collides(self, q: Configuration, tolerance: float = 0.0) -> bool:
+    def collides(self, q: ArrayLike, tolerance: float = 0.0) -> bool:
         """Whether any pair penetrates deeper than the tolerance [m]."""
         return self.nearest(q, -tolerance) is not None
 

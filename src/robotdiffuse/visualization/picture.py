@@ -243,12 +243,13 @@ def view_of_motion(
     size: tuple[int, int],
     free: tuple[float, float],
     azimuth: float | None = None,
+    traces: Sequence[Points] = (),
 ) -> Camera:
     """Of the framed views from AZIMUTHS x ELEVATIONS, the one that shows most of the arm, of its trace along
     a motion and of the obstacles.
 
     `among` are the obstacles. `azimuth` fixes the azimuth, measured from the x axis of the base [rad]; None:
-    the best one is chosen.
+    the best one is chosen. `traces` are further points that the picture must show.
     """
     q = dense(q)
     goal = arm.posed(q[-1])
@@ -256,7 +257,7 @@ def view_of_motion(
     trace = arm.tool_points(q)
     obstacles = join([obstacle.surface for obstacle in among])
     owners = np.repeat(np.arange(len(among)), [len(obstacle.surface.faces) for obstacle in among])
-    moving = np.concatenate([goal.vertices, ghosts.vertices, trace])
+    moving = np.concatenate([goal.vertices, ghosts.vertices, trace, *traces])
     middle, _ = ball_around(moving)
     near = np.linalg.norm(obstacles.vertices - middle, axis=1) < MAX_FRAMING_DISTANCE
     points = np.concatenate([moving, obstacles.vertices[near]])
@@ -480,7 +481,7 @@ def render(
     traces = [arm.trace(item.positions) for item in (motion, *others)]
     if camera is None:
         size = settings.width, settings.height
-        camera = view_of_motion(arm, obstacles, motion.positions, size, MARGINS, settings.azimuth)
+        camera = view_of_motion(arm, obstacles, q, size, MARGINS, settings.azimuth, traces[1:])
     large_camera = Camera(
         camera.eye, camera.target, SUPERSAMPLING * settings.width, SUPERSAMPLING * settings.height
     )

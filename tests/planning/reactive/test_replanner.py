@@ -14,10 +14,11 @@ import robotdiffuse as rd
 from helpers.panda import GOAL, PANDA, START
 from helpers.refusals import refuses
 from robotdiffuse.collision.moving_obstacles import MovingCollision
+from robotdiffuse.drawables import drawables
 from robotdiffuse.planning.reactive.replanner import JerkFilter, SpeedProfile, TimedPath
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.trajectories.speed_limits import jerk_limits
-from robotdiffuse.trajectories.timing_kernel import rounded_line
+from robotdiffuse.trajectories.timing_kernel import line_with_widths, rounded_line
 
 SPEED = 0.4
 PERIOD = 0.02
@@ -127,6 +128,39 @@ def test_unseen_obstacles_grow_with_time() -> None:
     replanner = loop(np.array([[0.5, 1.6, 0.5]]))
     replanner.step({"sphere": [0.5, 1.6, 0.5]}, 0.0)
     assert not replanner.step({}, 10.0).renewed
+
+
+def test_an_obstacle_that_is_not_seen_does_not_make_others_grow() -> None:
+    """Regression: all grew since the one that was seen longest ago, and the arm stood still for ever."""
+    moving = [rd.MovingObstacle(rd.Sphere([0.5, 1.6, 0.5], 0.1), max_speed=SPEED)]
+    moving.append(rd.MovingObstacle(rd.Box([3, 3, 0.5], [0.2] * 3, name="door"), max_speed=0.0))
+    replanner = rd.Replanner(rd.Problem(PANDA, rd.Scene([FLOOR]), START, GOAL, moving=moving))
+    replanner.step({"door": [3, 3, 0.5]}, 0.0)
+    assert replanner.step({"sphere": [0.5, 1.6, 0.5]}, 10.0).renewed
+
+
+def test_a_still_sphere_may_be_turned_and_a_box_may_turn_on_its_track_from_before_time_0() -> None:
+    """Regressions: both were refused as too fast; the pose at time 0 was the first of the track."""
+    replanner = loop(np.array([[0.5, 1.6, 0.5]]))
+    times = np.linspace(-2, 2, 41)
+    box = rd.Box([3.0 - 2.0, 3, 0.5], [0.4] * 3, name="cart")
+    poses = [rd.pose([3 + t, 3, 0.5], rpy=[0, 0, t + 2]) for t in times]
+    cart = rd.MovingObstacle(box, times=times, poses=poses)
+    with_cart = rd.Replanner(rd.Problem(PANDA, rd.Scene(), START, GOAL, moving=[cart]))
+    for k in range(50):
+        replanner.step({"sphere": rd.pose([0.5, 1.6, 0.5], rpy=[0, 0, 0.8])}, k * PERIOD)
+        with_cart.step({"cart": cart.pose(k * PERIOD)}, k * PERIOD)
+    (drawn,) = drawables(rd.Scene(), [cart])
+    assert np.allclose(drawn.surface_at(1.0).vertices.mean(axis=0), cart.at(1.0).center)
+
+
+def test_a_short_last_part_of_a_path_has_a_grid() -> None:
+    """Regression: grid points coincided within 3e-8 rad after the last corner (ZeroDivisionError)."""
+    q = np.zeros((3, 7))
+    q[1:, 0] = 4.5
+    q[2, 1] = 0.04375
+    path = TimedPath(PANDA, PANDA.acceleration, line_with_widths(q, np.array([0.04375 - 3e-8])), True)
+    assert (np.diff(path._grid[2]) > 0).all()
 
 
 def test_the_arm_waits_for_an_obstacle_at_the_goal() -> None:

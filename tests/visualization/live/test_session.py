@@ -238,6 +238,7 @@ VIEWS = "views: [{cloud: x.ply, camera: {xyz: [1, 0, 1], wxyz: [0, 1, 0, 0]}}]\n
         (GOOD.replace("panda", "pandora"), "unknown robot 'pandora'; known: "),
         (GOOD.replace("panda", "/etc/robot.urdf"), "unknown robot '/etc/robot.urdf'; known: "),
         (GOOD.replace("panda", "[panda]"), r"unknown robot \['panda'\]; known: "),
+        (GOOD.replace("panda", "null"), "unknown robot 'None'; known: .*panda"),
         (GOOD.replace("[]", "secret.yaml"), "secret.yaml is a file, and files are not read here"),
         (GOOD.replace("[]", "[{mesh: {file: /etc/passwd}}]"), "/etc/passwd is a file, and files are not"),
         (GOOD + VIEWS, "x.ply is a file, and files are not read here"),

@@ -181,7 +181,7 @@ class TimedPath:
         # s̈ is constant in an interval, and ṡ is 0 at the path's end, so an arm at rest in the last interval
         # could not start. This interval is divided until its last part is within the tolerance of `end`.
         parts = (grid[-1] - grid[-2]) * 0.5 ** np.arange(1, 26)
-        grid = np.concatenate([grid[:-1], grid[-1] - parts, grid[-1:]])
+        grid = np.concatenate([grid[:-1], grid[-1] - parts[parts > 4e-10], grid[-1:]])
         path = self.line(grid, 1), self.line(grid, 2), grid
         bounds = symmetric_bounds(self.acceleration, len(grid))
         return *path, controllable(*path, VELOCITY_FRACTION * self.robot.velocity, *bounds)
@@ -344,6 +344,8 @@ class ObservedObstacle:
             T = transform(xyz, T_before[:3, :3])
         else:
             T = rigid_transform(f"observation[{name!r}]", value)
+        shape = self.obstacle.shape.moved(T @ inverse(T_before))
+        T = shape.T_base_shape  # a sphere's frame does not turn with it
         max_speed = self.obstacle.top_speed
         velocity = self.velocity
         if np.isfinite(self.time):
@@ -357,7 +359,6 @@ class ObservedObstacle:
                     f"its maximum speed {max_speed:g} m/s allows {allowed} m"
                 )
             velocity = (T[:3, 3] - T_before[:3, 3]) / passed
-        shape = self.obstacle.shape.moved(T @ inverse(T_before))
         return ObservedObstacle(MovingObstacle(shape, max_speed=max_speed), now, velocity)
 
     def straight_on(self, now: float) -> MovingObstacle:
@@ -507,7 +508,7 @@ class Replanner:
         self._rng = np.random.default_rng(seed)
         self._seen = {
             obstacle.name: ObservedObstacle(
-                MovingObstacle(obstacle.shape, max_speed=obstacle.top_speed), velocity=obstacle.velocity
+                MovingObstacle(obstacle.at(0.0), max_speed=obstacle.top_speed), velocity=obstacle.velocity
             )
             for obstacle in problem.moving
         }
@@ -590,10 +591,11 @@ class Replanner:
         if np.isfinite(self._since):
             self._motion = self._motion.after(begins - self._since)
         self._since = begins
-        oldest = min(observed.time for observed in self._seen.values())
         predicted = self._predict()
-        grown = PredictedObstacles(
-            self._robot, [observed.obstacle for observed in self._seen.values()], oldest
+        seen = [(observed.obstacle, self._now - observed.time) for observed in self._seen.values()]
+        # each obstacle may have moved since it was last seen
+        grown = PredictedObstacles(self._robot, [obstacle for obstacle, _ in seen], self._now).wider(
+            np.array([obstacle.top_speed * age for obstacle, age in seen])
         )
         clear = self._choose_path(predicted)
         self._change_path()

@@ -498,10 +498,10 @@ def uploaded_problem(content: bytes, name: str, robot: Robot) -> Problem:
         raise InputError(f"{name} has {len(content)} bytes; at most {MAX_UPLOAD_SIZE} are read")
     text = decoded(content, name)
     data = parse_json(text, name) if name.lower().endswith(".json") else parse_yaml(text, name)
-    named_robot = data.get("robot") if isinstance(data, dict) else None
     robots: dict[Any, Robot] = {}
     try:
-        if named_robot is not None:
+        if isinstance(data, dict) and "robot" in data:
+            named_robot = data["robot"]
             names = known_robots()
             if named_robot not in (*names, robot.source):
                 raise unknown_name("robot", named_robot, names)
