@@ -41,6 +41,7 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 
 VALIDATOR = Tolerances()
+"""The validator's tolerances."""
 NORMAL_TOLERANCE = 1e-9
 """Largest difference of the length of a plane's normal from 1."""
 COVER_TOLERANCE = 1e-6
@@ -119,9 +120,9 @@ def _cover_errors(robot: Robot) -> Iterator[str]:
 def _proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     """Errors in the proof for the scene and between links, and in the proof for moving obstacles."""
     motion = certificate.motion
-    places = motion, certificate.between
-    along = configurations(*places), deviations(*places)
-    prover = Prover(problem.robot, problem.scene, *along)
+    q = configurations(motion, certificate.between)
+    off = deviations(motion, certificate.between)
+    prover = Prover(problem.robot, problem.scene, q, off)
     proof = certificate.proof
     stated = {"scene": certificate.scene_clearance, "self": certificate.self_clearance}
     is_pair = np.array([claim.against != SCENE for claim in proof.claims], bool)[proof.stretches.claim]
@@ -133,7 +134,8 @@ def _proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
         if moving is None:
             yield "proof: the part on moving obstacles is missing"
             return
-        prover = MovingProver(problem.robot, problem.moving, along[0], places_of(*places), along[1])
+        times = places_of(motion, certificate.between)
+        prover = MovingProver(problem.robot, problem.moving, q, times, off)
         yield from _bound_errors(
             prover, moving, {"scene": np.ones(len(moving.stretches.claim), bool)}, stated
         )
@@ -163,6 +165,7 @@ def _bound_errors(
     if wrong_planes:
         yield "proof: planes are given for stretches that are proved by spheres"
         return
+    # without planes, the rows of np.eye(3) stand in: they have length 1
     lengths = np.linalg.norm([plane.normal for plane in proof.planes] or np.eye(3), axis=1)
     not_unit = np.flatnonzero(~(np.abs(lengths - 1) <= NORMAL_TOLERANCE))
     if len(not_unit):

@@ -42,8 +42,8 @@ MIN_FOCAL_LENGTH = 1e-3
 NEAREST = 0.05
 """Nearer returns are ignored: they come from something that covers the lens [m]."""
 FARTHEST = 50.0
-"""If half of an image's returns are farther [m], its depths are not in meters, or one number in it means "no
-return"."""
+"""If half of an image's returns are farther [m], its depths are not in meters, or a large number stands for
+"no return"."""
 MAX_ANGLE = 0.5
 """Largest angle that `DepthView.pose_deviation` may state [rad]."""
 INTRINSICS = ("fx", "fy", "cx", "cy")

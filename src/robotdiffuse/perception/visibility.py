@@ -178,7 +178,7 @@ def see_through(depth, intrinsics, T, balls, radius, errors, border, seen):
         v1 = np.ceil(fy * (y + grown) / (near if y > -grown else far) + cy) + border
         if u0 < _ZERO or v0 < _ZERO or u1 > np.float32(w - 1) or v1 > np.float32(h - 1):
             continue
-        # at most half of MAX_DEPTH, the depth of pixels with nothing in range: these are behind every ball
+        # at most MAX_DEPTH / 2: pixels with nothing in range have the depth MAX_DEPTH, behind every ball
         min_return = min(far + errors[2] * far * far, MAX_DEPTH * _HALF)
         seen[n] = _all_behind(raw, int(v0), int(v1), int(u0), int(u1), min_return)
 

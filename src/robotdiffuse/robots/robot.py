@@ -292,8 +292,8 @@ class Robot(KinematicTree):
             The robot with these joints locked, in addition to those that are locked already.
 
         Raises:
-            InputError: For an unknown or fixed joint, a value that is not finite or is farther beyond a limit
-                than the joint's range, or a value of a mimic joint that contradicts the joint that it mimics.
+            InputError: For an unknown or fixed joint, a value beyond ±1e4, or farther beyond a limit than the
+                joint's range, or a value of a mimic joint that contradicts the joint that it mimics.
         """
         check_type("locked", locked, Mapping, "a mapping of joints to values")
         movable = {joint.name: joint for joint in self.joints if joint.movable}

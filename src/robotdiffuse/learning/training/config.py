@@ -179,7 +179,7 @@ class PlannerTraining(MotionTraining, ModelParts):
         if self.target == "limits" and self.smooth_noise:
             raise InputError("target is limits and smooth_noise is True; smooth_noise must be False then")
         if self.encoder_settings is not None:
-            ENCODERS.entry(self.encoder)  # a folder holds a trained encoder with its own settings
+            ENCODERS.entry(self.encoder)  # refuses a folder, whose encoder has its own settings
         check_points("encoder", self.encoder, self.denoiser)
         if not self.progressive:
             return
