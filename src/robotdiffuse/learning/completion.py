@@ -236,10 +236,10 @@ def predict(volume: ObservedVolume, network: Completion | None = None) -> Float3
     """The probability that each voxel of 2 cm holds an obstacle.
 
     It is 0 in voxels that were seen free. It is also 0 farther than 1 m from a Panda's shoulder, since
-    training did not cover these voxels. In lost regions (see `ObservedVolume.lost`),
-    which the network mistakes for free space, it is at least LOST_PROBABILITY. The lower corner of the grid
-    is `voxel_grid.LOW`, in the base frame.
-    network: None: the network that comes with the package.
+    training did not cover these voxels. Lost regions are the exception (see `ObservedVolume.lost`): there it
+    is at least LOST_PROBABILITY, also beyond 1 m, since the network mistakes them for free space. The lower
+    corner of the grid is `voxel_grid.LOW`, in the base frame. network: None: the network that comes with the
+    package.
     """
     return np.maximum(
         (network or exported_completion())(*pack(volume)),

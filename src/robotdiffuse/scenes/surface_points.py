@@ -1,6 +1,6 @@
 """Samples points on the surfaces of obstacles: the form in which networks receive a scene.
 
-`surface_clouds` does this for many scenes at once.
+`datasets.surface_clouds` does this for many scenes at once.
 """
 
 from dataclasses import dataclass

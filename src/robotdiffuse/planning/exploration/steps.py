@@ -79,7 +79,8 @@ class ExplorerSettings(Settings, name="explorer"):
     max_views: Natural = 8
     """Maximum number of steps of the kind look on the way to a goal."""
     look_attempts: Count = 4
-    """For each camera, a step tries to plan a motion to at most this many viewpoints, the best first."""
+    """A step tries to plan motions to at most this many viewpoints times the number of cameras, the best
+    first."""
     predict: bool = True
     """Whether the occupancy completion network weighs viewpoints and gives confidences, if it covers the
     arm's reach."""

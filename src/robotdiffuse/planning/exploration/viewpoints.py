@@ -339,8 +339,8 @@ def first_parts(waypoints: Configurations) -> Iterator[Configurations]:
         yield np.concatenate([waypoints[at < end], last[None]])
 
 
-# In each round, the tree grows towards TARGETS random targets, until it has CONFIGURATIONS configurations or
-# after ROUNDS rounds.
+# In each of at most ROUNDS rounds, the tree grows towards TARGETS random targets. No round begins once the
+# tree has CONFIGURATIONS configurations.
 CONFIGURATIONS = 900
 TARGETS = 1200
 ROUNDS = 5

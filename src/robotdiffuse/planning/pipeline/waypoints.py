@@ -84,12 +84,12 @@ def plan_through_waypoints(planner: Solver, problem: Problem, request: PlanReque
             return _joined(context, segments, _motions(context, segments))
         attempts += 1
         failed = segments[-1]
-        # an attempt that time cut short does not say why the attempt before it failed
+        # an attempt that ran out of time does not say why the attempt before it failed
         if failure is None or failed.status is not Status.TIMEOUT:
             failure = len(segments), failed
-        # Another seed cannot make an invalid configuration valid, nor a pose reachable. It also changes
-        # nothing if all goals before the failed segment are single configurations, since the segment then
-        # begins at the same one.
+        # Another seed cannot make an invalid configuration valid, nor a pose reachable. It also hardly helps
+        # if all goals before the failed segment are single configurations, since the segment then begins at
+        # the same one.
         hopeless = failed.status is Status.UNREACHABLE_GOAL or (
             failed.status is Status.INVALID_GOAL and isinstance(goals[len(segments) - 1], JointGoal)
         )

@@ -333,8 +333,8 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
             best_value = value
         if value <= enough or r == rounds:
             break
-        # `on_rim`: points to test against the owners of their cells: those that are `sharp` or in cells of
-        # several owners; all others are inside if these are. `first`: the owner of a point's first cell.
+        # `on_rim`: points to test against the owners of their cells: those that are `sharp` or whose cells
+        # have several owners; all others are inside if these are. `first`: owner of a point's first cell.
         first[:] = -1
         on_rim[:] = sharp
         ends[:] = 0
