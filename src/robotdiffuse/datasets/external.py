@@ -109,7 +109,7 @@ def write_dataset(
     if robot_fingerprint(load_robot(source)) != robot_fingerprint(arm):
         raise InputError(
             f"robot is {arm!r}; it must be load_robot({source!r}) as it is: data sets keep no tool, no held "
-            "objects and no other locked joints"
+            "objects and no joints locked after loading"
         )
     check_type("paths", paths, Iterable, "a list of motions")
     check_type("scenes", scenes, (Scene, list, tuple), "an rd.Scene, or a list of them")
@@ -226,7 +226,7 @@ def _positions(robot: Robot, i: int, path: object) -> ndarray:
         checked_configuration(robot, f"paths[{i}], row {row}", q[row], [])
     q = np.where(robot.continuous, q, np.clip(q, robot.lower, robot.upper))
     turns = np.concatenate([robot.whole_turns(q[:1]), robot.wraps(q)])
-    return q - np.cumsum(turns, axis=0)  # continuous joints may be wrapped to [-pi, pi]
+    return q - np.cumsum(turns, axis=0)  # the input may wrap continuous joints
 
 
 def _shared_floor(scenes: Sequence[Scene]) -> Box | None:
@@ -245,7 +245,7 @@ def _shared_floor(scenes: Sequence[Scene]) -> Box | None:
 
 
 def export_npz(folder: str | FilePath, file: str | FilePath) -> tuple[int, int]:
-    """Write a robot.npz, atomically, with the motions of all scenes that consist of exactly two spheres.
+    """Write a robot.npz, atomically, with the motions of all scenes of exactly two spheres, besides a floor.
 
     Returns the number of written motions and the number of motions that were left out.
 

@@ -315,7 +315,7 @@ def generate(
 
 
 def _shards(settings: GenerationSettings, indices: list[int], workers: int, cluster: str | None) -> Results:
-    """Yields the place of each index in the list, and the shard with this index as soon as it is made."""
+    """Yields, for each shard as soon as it is made, the place of its index in `indices` and the shard."""
     if cluster is None or not indices:
         return on_this_machine(make_shard, [(settings, index) for index in indices], workers)
     if names_a_file(settings.robot):  # nodes have other working folders

@@ -108,7 +108,7 @@ def gather(points, reach, spheres, voxel, keys, row_of, sums, count):
 
 @kernel(nogil=True)
 def image_points(depth, intrinsics, T):
-    """The points of a depth image [3, h w] in the base frame; NaN for pixels without a return and for flying
+    """The points [3, h w] of a depth image in the base frame; NaN for pixels without a return and for flying
     pixels.
 
     At edges, sensors mix the depths of the near and the far surface. A pixel counts as flying if fewer than

@@ -61,14 +61,15 @@ LIMIT_TOLERANCE = 1e-6
 """Fraction by which a motion with a start speed may exceed the limits."""
 START_SHARES = tuple(ACCELERATION_FACTOR**k for k in range(16))
 """Fractions of the acceleration limits that are tried in turn for a motion with a start speed."""
-MAX_SHARES = 12
-"""Largest number of attempts for a motion with a start speed. Each further attempt lowers the limits at
-grid points, until the real limits hold between them."""
+MAX_SPEED_ATTEMPTS = 12
+"""Largest number of attempts in `_fastest_speeds`, for each of START_SHARES. Each further attempt lowers the
+limits at grid points, until the real limits hold between them."""
 BRAKING_FRACTION = 0.9
 """Fraction of the possible deceleration that `stopping_distance` assumes; the remainder allows corners to be
 rounded."""
 MIN_STOPPING_DISTANCE = 0.01
-"""Smallest result of `stopping_distance` [rad], so that a corner at the end of the line can be rounded."""
+"""Smallest result of `stopping_distance` [rad] where there is room for it, so that a corner at the end of the
+line can be rounded."""
 
 
 class TooFastError(RuntimeError):
@@ -97,8 +98,8 @@ class TimingSettings(Settings, name="timing"):
     """Smallest number of grid intervals in a rounded corner; a long corner has as many as a straight part of
     the same length."""
     line_intervals: Count = 64
-    """Number of grid intervals of each motion from stop to stop, distributed by length; more where short
-    parts get their smallest numbers of intervals."""
+    """Number of grid intervals of each motion from stop to stop, distributed by length. Each part has a
+    smallest number of intervals, so the total may be larger."""
 
 
 DEFAULT = TimingSettings()
@@ -331,7 +332,7 @@ def _fastest_speeds(
     everywhere. Raises TooFastError if no motion does."""
     share = 1.0
     at_start = start_speed * np.abs(line(grid[:1], 1)[0])
-    for _ in range(MAX_SHARES):
+    for _ in range(MAX_SPEED_ATTEMPTS):
         check_timing("the fastest speeds")
         # the start velocity is fixed, so velocity limits below it could not be met
         limits = np.minimum(velocity, np.maximum(share * velocity, at_start)), share**2 * acceleration

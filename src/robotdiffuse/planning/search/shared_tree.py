@@ -399,8 +399,8 @@ class SharedTreeSearch:
             self._lower_distance()
 
     def _lower_distance(self) -> None:
-        """Go on with the next safety distance, and add straight paths to goals that are free at this
-        distance. The tree stays valid, since safety distances only fall."""
+        """Go on with the next safety distance. The straight paths that are free at it are added to the tree.
+        The tree stays valid, since safety distances only fall."""
         self.safety_distance = self._later_distances.pop(0)
         """Distance to obstacles that paths keep, except near a start or goal that is closer to them [m]."""
         self._rounds_at_distance = 0
@@ -410,14 +410,14 @@ class SharedTreeSearch:
             if motions_free(self._space, line)[0]:
                 graft(self.tree, self.targets, line, g)
 
-    def _connect(self, targets: ndarray) -> None:
+    def _connect(self, indices: ndarray) -> None:
         iterations = self.settings.connect_iterations
-        trees = rrt_kernel.make_trees(self.start, self.goals[targets], 8 * iterations + len(targets))
+        trees = rrt_kernel.make_trees(self.start, self.goals[indices], 8 * iterations + len(indices))
         path = rrt_kernel.search(self._space, None, trees, INFINITE, self._longest, iterations, self._state)
         if len(path):
-            self._graft(path, int(targets[np.abs(self.goals[targets] - path[-1]).max(axis=1).argmin()]))
-        elif len(targets) == 1:
-            self.targets.failures[targets] += 1
+            self._graft(path, int(indices[np.abs(self.goals[indices] - path[-1]).max(axis=1).argmin()]))
+        elif len(indices) == 1:
+            self.targets.failures[indices] += 1
 
     def _graft(self, path: Configurations, g: int) -> None:
         shorter = tighten(self._space, simplify(self._space, path, 0), TIGHTENINGS, self._state)
