@@ -24,7 +24,8 @@ Differences from the paper:
   about as many outputs as in the paper. With half dropped, Pnet learns far less in this shorter training.
 - A training sample is a random waypoint of a trajectory of the data and the one about 0.7 rad further on
   (the paper: neighboring vertices of optimized RRT* paths). On average, 0.7 rad is a sixth of a path, and a
-  path of such straight steps is 0.3 % shorter. The step has the same length everywhere but at the goal; if it were a fraction of the path's length, the same inputs could have different targets.
+  path of such straight steps is 0.3 % shorter. The step has the same length everywhere but at the goal; if it
+  were a fraction of the path's length, the same inputs could have different targets.
 - Half of the samples have a random later waypoint as their goal, since bidirectional planning and replanning
   need steps to such goals.
 """
