@@ -319,7 +319,7 @@ class PlanningContext:
         )
         first_path_note = f", its first path came after {self.first_path_at:.2f} s" if self._progress else ""
         return (
-            f"the time limit of {self.request.time_limit:g} s is too short {error.what}: there was no time "
+            f"the time limit is too short {error.what}: there was no time "
             f"for {error} after {self.elapsed:.2f} s; {before}{first_path_note}"
         )
 

@@ -129,6 +129,7 @@ class Diffusion(ExportedPlanner[DiffusionSettings]):
         valid = list[Path]()
         until = context.request.time_limit
         while not samples or (context.elapsed < until and (valid or self.settings.repeat)):
+            began = context.elapsed
             batch = self.draw(
                 model, start_goal.checker, embedding, start, goals, rng, constraints=constraints
             )
@@ -139,9 +140,11 @@ class Diffusion(ExportedPlanner[DiffusionSettings]):
             for path in passed:
                 context.improved(path.length)
             if passed and not valid:
-                until = min(context.elapsed + self.settings.optimize_time, context.request.time_limit)
+                until = context.elapsed + self.settings.optimize_time
             samples = samples + paths
             valid = valid + passed
+            if valid:  # a further batch must leave time to time the best path
+                until = min(until, context.search_until - (context.elapsed - began))
         reason = f"{len(valid)} of {len(samples)} samples of the network are valid"
         # If no sample is valid, the last one is validated again, so that the result names its violation.
         for path in sorted(valid or samples[-1:], key=lambda path: path.length):

@@ -52,6 +52,14 @@ def test_a_start_that_is_hit_at_once_is_invalid_and_a_wall_that_comes_cannot_be_
     assert found.status is rd.Status.TIMEOUT and "passes the moving obstacles" in found.reason
 
 
+def test_progress_counts_from_the_call() -> None:
+    """Regression: it counted from the attempt that found the path; the straight line is blocked for good."""
+    ball = rd.MovingObstacle(rd.Sphere([0.55, 0, 0.55], 0.12), velocity=[1e-4, 0, 0])
+    ends = [[side, 0.3, 0, -1.8, 0, 2.1, 0.8] for side in (-1.0, 1.0)]
+    result = rd.plan(rd.Problem(PANDA, rd.Scene(), *ends, moving=[ball]), 60.0, until="first")
+    assert result.progress[-1][0] > 0.1 * result.planning_time
+
+
 def test_the_earliest_schedule_waits_for_a_passing_obstacle() -> None:
     clear = np.ones((3, 10), bool)
     clear[1, 1:4] = False

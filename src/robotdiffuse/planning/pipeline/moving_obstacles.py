@@ -160,6 +160,7 @@ def plan_among_moving_obstacles(planner: Solver, problem: Problem, request: Plan
         limit = max(PATH_TIME_FRACTION * (request.time_limit - context.elapsed), 1e-3)
         path_request = replace(request, time_limit=limit, seed=request.seed + attempts // 2)
         at_rest = replace(still, scene=scene)
+        began = context.elapsed
         if problem.waypoints:
             result = plan_through_waypoints(planner, at_rest, path_request)
         else:
@@ -190,6 +191,7 @@ def plan_among_moving_obstacles(planner: Solver, problem: Problem, request: Plan
                     planning_time=context.elapsed,
                     seed=request.seed,
                     trajectory=timed,
+                    progress=tuple((began + at, length) for at, length in result.progress),
                     **least_clearances(result, report),
                     notes=context.notes_with(result.notes),
                 )
