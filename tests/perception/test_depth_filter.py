@@ -45,6 +45,9 @@ def test_noise_is_measured_on_images_of_a_still_scene() -> None:
     noise = DepthNoise(spread=0.004, correlation=1.5, missing=0.05)
     images = [noise.applied(view, np.random.default_rng(i)).depth for i in range(4)]
     found = rd.measure_noise(images)
+    # regression: depths above 1e4, which mean that nothing is in range, counted as exact
+    far = [[np.where(np.arange(image.shape[1]) > 180, depth, image) for image in images] for depth in (1e6, np.inf)]
+    assert rd.measure_noise(far[0]).spread == rd.measure_noise(far[1]).spread
     assert found.spread == pytest.approx(0.004, rel=0.15) and found.correlation == pytest.approx(1.5, rel=0.4)
     assert 0.04 < found.missing < 0.12
     stated = replace(noise.applied(view, np.random.default_rng(9)), noise=found)

@@ -239,12 +239,24 @@ def test_a_cut_ply_mesh_is_refused(tmp_path: Path) -> None:
     mesh: Any = trimesh.creation.box().export(file_type="ply", encoding="ascii")
     (tmp_path / "cut.ply").write_bytes(b"\n".join(mesh.splitlines()[:-3]))
     refuses("states 20 vertices, faces and other elements, but it holds 17", read_triangles, tmp_path / "cut.ply")
+    stl: Any = trimesh.creation.box().export(file_type="stl")
+    (tmp_path / "cut.stl").write_bytes(stl[:-30])
+    refuses("it has 654 of the 684 bytes that its header states", read_triangles, tmp_path / "cut.stl")
+    (tmp_path / "long.stl").write_bytes(stl + b"xx")
+    assert len(read_triangles(tmp_path / "long.stl")[1]) == 12
 
 
 @pytest.mark.parametrize(
     ("content", "expected"),
-    [(b"\xef\xbb\xbf1,2,3\n4,5,6\n", [[1, 2, 3], [4, 5, 6]]), (b"#r,x,y,z\n9,1,2,3\n", [[1, 2, 3]])],
-    ids=["a byte order mark", "names of columns in a comment"],
+    [
+        (b"\xef\xbb\xbf1,2,3\n4,5,6\n", [[1, 2, 3], [4, 5, 6]]),
+        (b"#r,x,y,z\n9,1,2,3\n", [[1, 2, 3]]),
+        (b"# scan 7\n# r,x,y,z\n9,1,2,3\n", [[1, 2, 3]]),
+        (b"x,y,z\n,,\n1,2,3\n", [[1, 2, 3]]),
+        (b'"x","y","z"\n"1","2","3"\n', [[1, 2, 3]]),
+        (b"1,2,3,\n", [[1, 2, 3]]),
+    ],
+    ids=["a byte order mark", "names in a comment", "names in another", "empty cells", "quoted", "a comma at the end"],
 )
 def test_what_is_before_the_numbers_is_read(content: bytes, expected: list[list[int]], tmp_path: Path) -> None:
     (tmp_path / "points.csv").write_bytes(content)
@@ -278,11 +290,13 @@ def test_shapes_from_files_are_written_as_names_of_files(tmp_path: Path) -> None
     trimesh.creation.box([1, 2, 3]).export(tmp_path / "box.stl")
     np.save(tmp_path / "cloud.npy", [[0.1, 0.2, np.nan], [1, 2, 3]])
     entries = [{"mesh": {"file": "box.stl", "xyz": [0, 0, 1]}}, {"point_cloud": {"file": "cloud.npy", "point_radius": 0.02}}]
+    (tmp_path / "box.stl").rename(tmp_path / "blob")
+    (tmp_path / "box.stl").symlink_to("blob")  # regression: the target's name, which has no ending, was written
     scene, notes = read_scene(entries, tmp_path)
     assert len(notes) == 1 and "1 of 2 points" in notes[0]
     written = scene_entries(scene, tmp_path)
     assert written == [{"mesh": {"file": "box.stl", "xyz": [0.0, 0.0, 1.0]}}, entries[1]]
-    assert scene_entries(scene, None)[0]["mesh"]["file"] == str((tmp_path / "box.stl").resolve())
+    assert scene_entries(scene, None)[0]["mesh"]["file"] == str(tmp_path.resolve() / "box.stl")
     assert_equal(scene, read_scene(written, tmp_path)[0])
     # regression: points that were replaced since were lost, since their old file was named
     changed = rd.Scene([replace(scene.shapes[1], points=[[3.0, 2, 1]])])  # type: ignore[type-var]

@@ -89,6 +89,11 @@ def read_triangles(
             resolver = _buffer_resolver(path)
         if ending == ".ply":
             check_ply(content)
+        if ending == ".stl" and b"facet" not in content[:1000]:
+            end = 84 + 50 * int.from_bytes(content[80:84], "little")  # after the last triangle
+            if len(content) < end:
+                raise InputError(f"it has {len(content):,} of the {end:,} bytes that its header states")
+            content = content[:end]
         with np.errstate(all="ignore"):
             mesh = trimesh.load_mesh(
                 io.BytesIO(content),

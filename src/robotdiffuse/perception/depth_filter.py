@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int32
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.errors import InputError, form, located, numbers, shown
+from robotdiffuse.core.errors import MAX_COORDINATE, InputError, form, located, numbers, shown
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Points, Spheres, Values, for_kernels
 from robotdiffuse.perception.depth_view import (
@@ -354,6 +354,7 @@ def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
     if len(forms) < 2 or len({*forms}) > 1 or forms[0].count(" x ") != 1:
         raise InputError(f"images are {shown(forms)}; at least two images of one size, h x w, are needed")
     stack = np.array(arrays, np.float32)
+    stack[stack > MAX_COORDINATE] = np.inf  # nothing in range, as in DepthView
     seen, inverse = _inverse_depths(stack)
     always = np.equal(seen.sum(axis=0), len(stack))
     if not always.any():

@@ -195,7 +195,7 @@ def contacts_entry(scene: Scene) -> dict[str, object]:
 def name_from(folder: Path | None, file: Path) -> str:
     """The path of a file as it is written: relative to `folder` if the file is in or below it, so that the
     folder can be moved, else absolute."""
-    file = file.resolve()
+    file = file.parent.resolve() / file.name  # a link's target may have another ending
     if folder is None:
         return str(file)
     folder = folder.resolve()

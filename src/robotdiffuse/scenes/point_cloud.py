@@ -13,6 +13,7 @@ import struct
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy import ndarray
@@ -208,8 +209,14 @@ def _read_text(file: Path) -> ndarray:
     with file.open(encoding=UTF8) as stream:
         lines = ((number, line) for number, line in enumerate(stream) if line.strip())
         at, first = next(lines, (0, ""))
-        following = next((line for _, line in lines if line.lstrip()[0] != "#"), "")
-    names = [name.strip().strip('"').lower() for name in first.lstrip("#/ ").split(_delimiter(first))]
+        following = ""
+        for number, line in lines:
+            if line.lstrip()[0] not in "#/":
+                following = line
+                break
+            if {"x", "y", "z"} <= {*_names(line)}:  # of several comments, one may name the columns
+                at, first = number, line
+    names = _names(first)
     header = False
     try:
         float(names[0] if names else "")
@@ -223,7 +230,22 @@ def _read_text(file: Path) -> ndarray:
         return np.zeros((0, 3))
     delimiter = _delimiter(following if header else first)
     skipped = at + int(header)
-    return np.loadtxt(file, delimiter=delimiter, skiprows=skipped, usecols=columns, ndmin=2, encoding=UTF8)
+    options: dict[str, Any] = {
+        "delimiter": delimiter,
+        "skiprows": skipped,
+        "usecols": columns,
+        "ndmin": 2,
+        "encoding": UTF8,
+        "quotechar": '"',
+    }
+    try:
+        return np.loadtxt(file, **options)
+    except ValueError:  # slower: empty cells are missing measurements
+        return np.loadtxt(file, converters=lambda text: float(text.strip() or "nan"), **options)
+
+
+def _names(line: str) -> list[str]:
+    return [name.strip().strip('"').lower() for name in line.lstrip("#/ ").split(_delimiter(line))]
 
 
 def _delimiter(line: str) -> str | None:
