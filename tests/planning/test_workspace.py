@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from inspect import unwrap
 from itertools import pairwise
 from typing import Any
 
@@ -147,6 +148,20 @@ def test_bad_input() -> None:
     refuses("time_limit is -1", space.plan_steps, [rd.MoveTo("ready")], "ready", -1.0)
     refuses("frame is 'base'; it must be 'tip' or 'world'", rd.MoveRelative, [0, 0, 0.1], "base")
     refuses(r"xyz is .*; it must be 3 finite numbers", rd.MoveRelative, [0, 0.1])
+
+
+def test_a_tool_that_is_detached_is_no_tip_and_its_shapes_have_names_of_their_own() -> None:
+    """Regressions: the tip was a link that was gone; an obstacle had the name of a held object."""
+    arm = PANDA.attach(rd.Box([0, 0, 0.15], [0.05] * 3, name="box"), "panda_hand")
+    space = rd.Workspace(arm.with_tool("panda_hand", rd.pose([0, 0, 0.3]), [rd.Box([0, 0, 0.3], [0.02] * 3)]))
+    refuses("a shape of tool is named box", space.detach, "tool", "ready")
+    space = rd.Workspace(PANDA.with_tool("panda_hand", rd.pose([0, 0, 0.3])))
+    space.detach("tool", "ready")
+    assert space.tip == "panda_hand" and space.pose("ready").shape == (4, 4)
+    goals = [space.pose("ready"), rd.JointGoal(GOAL)]  # regression: the matrix counted as values of joints
+    assert space.plan(goals, "extended", until="first").solved
+    refuses("shapes is .*each an argument of its own", unwrap(rd.Workspace.add), space, [rd.Sphere([1, 1, 1], 0.1)])
+    refuses(r"steps\[0\].name is 3", space.plan_steps, [rd.MoveTo("extended", name=3)], "ready")  # type: ignore
 
 
 def test_values_by_joint_are_a_configuration() -> None:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.core.errors import (
     InputError,
+    check_list,
     check_name,
     check_type,
     counted,
@@ -288,6 +289,7 @@ class Workspace:
             InputError: For anything but shapes, two shapes with equal names, and a shape with the name of a
                 held object.
         """
+        check_list("shapes", shapes, Shape, "shapes, each an argument of its own")
         new = Scene(shapes).moved(self._T_base_world).shapes
         names = [shape.name for shape in new]
         for body in self.robot.attached:
@@ -377,7 +379,12 @@ class Workspace:
             InputError: For an unknown name, q of the wrong length or out of limits, an object that holds
                 another one, and an object that is no shape.
         """
-        self.scene, self.robot = self.scene.detach(name, self.robot, self._configuration(q))
+        scene, robot = self.scene.detach(name, self.robot, self._configuration(q))
+        shared = {shape.name for shape in scene.shapes} & {body.name for body in robot.attached}
+        if shared:
+            raise InputError(f"a shape of {name} is named {min(shared)}, as an object that the robot holds")
+        self.scene, self.robot = scene, robot
+        self.tip = self.robot.tip if self.tip == name else self.tip
 
     def pose(self, q: AnyConfiguration, link: str | None = None) -> ndarray:
         """Forward kinematics: the pose of a link.
@@ -504,6 +511,7 @@ class Workspace:
         check_type("steps", steps, (list, tuple), "a list of steps")
         for i, step in enumerate(steps):
             check_type(f"steps[{i}]", step, Step.__args__, "rd.MoveTo, MoveRelative, Attach or Detach")
+            check_type(f"steps[{i}].name", step.name, str, "a text")
             if isinstance(step, MoveTo | MoveRelative):
                 check_type(f"steps[{i}].contacts", step.contacts, Mapping, "a mapping of obstacles to links")
         if "constraints" in request:
@@ -697,6 +705,8 @@ class Workspace:
         matrices = numbers(goal)
         if matrices is not None and matrices.ndim == 3:
             return AnyGoal(tuple(self._goal(T) for T in matrices))
+        if matrices is None and isinstance(goal, (list, tuple)):
+            return [self._goal(item) for item in goal]
         if matrices is None or matrices.shape != (4, 4):
             return goal
         # four configurations of four joints have this shape too; a transposed pose is refused below
