@@ -11,7 +11,7 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space, motions_free, path_length
 from robotdiffuse.core.settings import Settings
-from robotdiffuse.core.types import Configuration, Configurations
+from robotdiffuse.core.types import Configuration, Configurations, nearest_first
 from robotdiffuse.learning import need_packages
 from robotdiffuse.learning.weight_files import check_weights
 from robotdiffuse.planning.planner import Planner
@@ -73,8 +73,7 @@ class ExportedPlanner(LearnedPlanner[LearnedPlannerSettings]):
 def nearest_goals(start: Configuration, goals: Configurations, samples: int) -> Configurations:
     """The goals among which a batch of `samples` samples is divided, the nearest to the start first: at
     most as many as can get SAMPLES_PER_GOAL samples each, but at least one."""
-    order = np.argsort(np.linalg.norm(goals - start, axis=1))
-    return goals[order[: max(samples // SAMPLES_PER_GOAL, 1)]]
+    return nearest_first(goals, start)[: max(samples // SAMPLES_PER_GOAL, 1)]
 
 
 class Attempt(NamedTuple):

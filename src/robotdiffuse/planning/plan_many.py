@@ -159,11 +159,11 @@ def _planned_on_cluster(
 def _plan_on_node(
     arguments: PlannerArguments, request: PlanRequest, problems: list[Problem]
 ) -> list[PlanResult]:
-    session = _Session(arguments, request)
+    plan = _session(arguments, request)
     results = []
     for problem in problems:
         try:
-            results.append(session.plan(problem))
+            results.append(plan(problem))
         except Exception as error:
             results.append(_error(arguments[0], problem, f"{type(error).__name__}: {error}", request))
     return results
@@ -174,32 +174,32 @@ def _error(planner: str, problem: Problem, reason: str, request: PlanRequest) ->
     return replace(failed, problem=problem)
 
 
-class _Session:
-    """A loaded planner, which compiles its code before the first problem of each robot."""
+def _session(arguments: PlannerArguments, request: PlanRequest) -> Callable[[Problem], PlanResult]:
+    """A function that plans with one loaded planner, which compiles its code before the first problem of each
+    robot."""
+    planner = load_planner(*arguments)
+    warm = set[Robot]()
 
-    def __init__(self, arguments: PlannerArguments, request: PlanRequest) -> None:
-        self.planner = load_planner(*arguments)
-        self.request = request
-        self.warm = set[Robot]()
-
-    def plan(self, problem: Problem) -> PlanResult:
+    def plan(problem: Problem) -> PlanResult:
         """The result without its problem, which the caller has."""
-        if problem.robot not in self.warm:
-            self.planner.warm_up(problem)
-            self.warm.add(problem.robot)
-        return replace(self.planner.plan(problem, **vars(self.request)), problem=None)
+        if problem.robot not in warm:
+            planner.warm_up(problem)
+            warm.add(problem.robot)
+        return replace(planner.plan(problem, **vars(request)), problem=None)
+
+    return plan
 
 
 # What a worker process keeps between problems
-_state: tuple[_Session, list[Robot]] | None = None
+_state: tuple[Callable[[Problem], PlanResult], list[Robot]] | None = None
 
 
 def _prepare(arguments: PlannerArguments, robots: list[Robot], request: PlanRequest) -> None:
     global _state
-    _state = _Session(arguments, request), robots
+    _state = _session(arguments, request), robots
 
 
 def _plan(robot: int, values: dict[str, Any]) -> PlanResult:
     assert _state is not None
-    session, robots = _state
-    return session.plan(Problem(robots[robot], **values))
+    plan, robots = _state
+    return plan(Problem(robots[robot], **values))

@@ -65,8 +65,15 @@ def _kept(value: Any) -> Any:
     return value if array is None else array
 
 
+class _OwnValues:
+    """Base of steps: their fields do not change with what was given."""
+
+    def __post_init__(self) -> None:
+        self.__dict__.update(_kept(vars(self)))
+
+
 @frozen_dataclass
-class MoveTo:
+class MoveTo(_OwnValues):
     """A step of `Workspace.plan_steps`: move around the obstacles to a goal."""
 
     goal: Any
@@ -82,13 +89,9 @@ class MoveTo:
     name: str = "move to"
     """Name of the step, for messages."""
 
-    def __post_init__(self) -> None:
-        for name in ("goal", "constraints", "contacts"):
-            object.__setattr__(self, name, _kept(getattr(self, name)))
-
 
 @frozen_dataclass
-class MoveRelative:
+class MoveRelative(_OwnValues):
     """A step of `Workspace.plan_steps`: move the tip along a straight line and keep its orientation."""
 
     xyz: ArrayLike
@@ -108,12 +111,12 @@ class MoveRelative:
             raise InputError(f"{self.name}: xyz is {shown(self.xyz)}; it must be 3 finite numbers [m]")
         if not isinstance(self.frame, str) or self.frame not in (TIP, WORLD):
             raise InputError(f"{self.name}: frame is {shown(self.frame)}; it must be {TIP!r} or {WORLD!r}")
-        object.__setattr__(self, "xyz", xyz)  # a copy, which does not change with the array that was given
-        object.__setattr__(self, "contacts", _kept(self.contacts))
+        object.__setattr__(self, "xyz", xyz)
+        super().__post_init__()
 
 
 @frozen_dataclass
-class Attach:
+class Attach(_OwnValues):
     """A step of `Workspace.plan_steps`: the robot takes an obstacle."""
 
     obstacle: str
@@ -124,9 +127,6 @@ class Attach:
     """Further links that it may touch while it is held."""
     name: str = "attach"
     """Name of the step, for messages."""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "touch_links", _kept(self.touch_links))
 
 
 @frozen_dataclass

@@ -140,6 +140,12 @@ def _limit(name: str) -> "cached_property[JointValues]":
     )
 
 
+def _of_kind(kind: str) -> "cached_property[JointMask]":
+    return cached_property(
+        lambda tree: read_only(np.array([joint.kind == kind for joint in tree.planned_joints], dtype=bool))
+    )
+
+
 class KinematicTree(Value):
     """Base class of `Robot`: joints, limits and frames. `Robot` declares the fields and describes the
     frames."""
@@ -229,14 +235,10 @@ class KinematicTree(Value):
         excess[..., self.continuous] = 0.0
         return excess
 
-    @cached_property
-    def prismatic(self) -> tuple[bool, ...]:
-        return tuple(joint.kind == "prismatic" for joint in self.planned_joints)
-
-    @cached_property
-    def continuous(self) -> JointMask:
-        """Which planned joints rotate without limits, so that values one turn apart are equivalent."""
-        return read_only(np.array([joint.kind == "continuous" for joint in self.planned_joints], dtype=bool))
+    prismatic = _of_kind("prismatic")
+    """Which planned joints slide."""
+    continuous = _of_kind("continuous")
+    """Which planned joints rotate without limits, so that values one turn apart are equivalent."""
 
     def whole_turns(self, q: JointArray) -> JointArray:
         """The multiples of 2 pi to subtract so that continuous joints are within [-pi, pi]; 0 for other
@@ -254,7 +256,7 @@ class KinematicTree(Value):
     def unwound(self, q: JointArray) -> JointArray:
         """Equivalent configurations: joints with a range above one turn are turned by whole turns to within
         half a turn of the middle of their limits."""
-        return np.where(self._more_than_a_turn, q - TURN * np.round((q - self.middle) / TURN), q)
+        return self._turned(q, self.middle, self._more_than_a_turn)
 
     def equivalent_configurations(self, q: Configuration, start: Configuration) -> Configurations:
         """`turned_both_ways` for the joints that have limits and a range above one turn."""
@@ -299,7 +301,7 @@ class KinematicTree(Value):
     @cached_property
     def _more_than_a_turn(self) -> JointMask:
         """Whether the range of a joint is more than one turn."""
-        return read_only((self.upper - self.lower > TURN) & ~np.array(self.prismatic, dtype=bool))
+        return read_only((self.upper - self.lower > TURN) & ~self.prismatic)
 
     @cached_property
     def _frames(self) -> tuple[dict[str, tuple[int, ndarray]], ndarray, ndarray]:

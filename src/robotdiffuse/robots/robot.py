@@ -221,7 +221,7 @@ class Robot(KinematicTree):
         frames = self.frames_at(np.atleast_2d(rows))
         origins = (frames[self.link_frame(name)] @ self.T_frame_link(name))[:, :3, 3]
         chain = list(self.chain(name))
-        slides = np.array(self.prismatic)[chain, None, None]
+        slides = self.prismatic[chain, None, None]
         T = np.array(frames)[1:][chain]
         axes = T[..., :3, 2]
         J = np.zeros((len(origins), 6, self.dof))
@@ -482,15 +482,14 @@ class Robot(KinematicTree):
 
         joints = ", ".join(self.joint_names)
         spheres = sum(map(len, self.spheres.values()))
-        locked_text = ", ".join(f"{name} = {value:g}" for name, value in list(self.locked.items())[:6])
-        more = f" and {len(self.locked) - 6} more" if len(self.locked) > 6 else ""
+        locked_text = joined((f"{name} = {value:g}" for name, value in self.locked.items()), 6)
         lines = [
             f"Robot {self.name!r}: {counted(self.dof, 'planned joint')} from {self.base} to "
             f"{' and '.join(self.tips)}",
             f"  joints  {joints}",
             f"  lower   {row(self.lower)}",
             f"  upper   {row(self.upper)}",
-            f"  locked  {locked_text}{more}" if locked_text else "",
+            f"  locked  {locked_text}" if locked_text else "",
             f"  {counted(spheres, 'sphere')} on {len(self.spheres)} of {len(self.link_names)} links, "
             f"{counted(len(self.checked_pairs()), 'checked pair')} of links",
             f"  holds   {', '.join(body.name for body in self.attached)}" if self.attached else "",

@@ -12,7 +12,7 @@ import json
 import os
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TypeVar
@@ -202,13 +202,8 @@ def _to_json(robot: Robot, source: JsonObject) -> dict:
 def _table_to_json(table: LinkPairTable) -> dict:
     """JSON entry of a table. Cells along the last joint are packed as bits; each row is a hexadecimal
     string."""
-    return {
-        "links": table.links,
-        "joints": table.joints,
-        "lower": table.lower,
-        "upper": table.upper,
-        "apart": [row.tobytes().hex() for row in np.packbits(np.atleast_2d(table.apart), axis=1)],
-    }
+    rows = np.packbits(np.atleast_2d(table.apart), axis=1)
+    return asdict(table) | {"apart": [row.tobytes().hex() for row in rows]}
 
 
 def _table_from_json(data: dict) -> LinkPairTable:
@@ -225,13 +220,8 @@ def _table_from_json(data: dict) -> LinkPairTable:
 
 
 def _joint_to_json(joint: Joint) -> dict:
-    data = {
-        "name": joint.name,
-        "kind": joint.kind,
-        "parent": joint.parent,
-        "child": joint.child,
-        **pose_entry(joint.T_parent_joint),
-    }
+    data: JsonObject = {name: getattr(joint, name) for name in ("name", "kind", "parent", "child")}
+    data |= pose_entry(joint.T_parent_joint)
     if joint.movable:
         data |= {"axis": joint.axis.tolist()} | {name: getattr(joint, name) for name in LIMITS}
     if joint.effort:

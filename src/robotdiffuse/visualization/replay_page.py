@@ -151,7 +151,7 @@ def page_data(
             "joints": list(robot.joint_names),
             "offsets": [_rounded(offset[:3].reshape(-1), 9) for offset in robot.frame_offsets],
             "parents": robot.parents.tolist(),
-            "prismatic": list(robot.prismatic),
+            "prismatic": robot.prismatic.tolist(),
             "frames": [_packed(surface) if len(surface.faces) else None for surface in arm.surfaces],
             "spheres": _spheres(robot),
             "tool": {"frame": arm.tool_frame, "point": _rounded(arm.tool_point, 5)},

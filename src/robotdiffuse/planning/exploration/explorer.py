@@ -577,11 +577,12 @@ class Explorer:
     def _along(self, problem: Problem, waypoints: Configurations, name: str) -> PlanResult | None:
         """The motion along waypoints, if the validator accepts it in the problem's scene; else None."""
         problem = replace(problem, goal=JointGoal(waypoints[-1:]))
-        result = self._context(problem, self.settings.time_limit).finish(waypoints, name, name)
+        result = self._context(problem).finish(waypoints, name, name)
         return None if result is None else replace(result, problem=problem)
 
-    def _context(self, problem: Problem, limit: float, seed: int = 0) -> PlanningContext:
-        return PlanningContext(self._planner.name, problem, PlanRequest(limit, seed, FIRST))
+    def _context(self, problem: Problem, seed: int = 0) -> PlanningContext:
+        request = PlanRequest(self.settings.time_limit, seed, FIRST)
+        return PlanningContext(self._planner.name, problem, request)
 
     def _least_unseen(self, as_seen: Problem) -> tuple[PlanResult, Voxels]:
         """A motion among seen obstacles, and the unseen voxels on it that views should show.
@@ -598,11 +599,11 @@ class Explorer:
         avoided = cover(self.map, self.scene, MAP.centers(blocked), MAP.edge, name)
         avoiding = replace(as_seen, scene=added(as_seen.scene, [avoided]))
         results = list[tuple[PlanResult, Voxels]]()
-        for seed in range(self._seed, self._seed + TENTATIVE_MOTIONS):
-            result = self._planned(avoiding, QUICK_FRACTION * self.settings.time_limit, seed)
+        for attempt in range(TENTATIVE_MOTIONS):
+            result = self._planned(avoiding, QUICK_FRACTION * self.settings.time_limit, attempt)
             if result.path is None and not any(earlier.solved for earlier, _ in results):
                 avoiding = as_seen
-                result = self._planned(as_seen, self.settings.time_limit, seed)
+                result = self._planned(as_seen, self.settings.time_limit, attempt)
             # without a path, the voxels are not used
             unseen = ends if result.path is None else self.wanted(result.path)
             results.append((result, unseen))
@@ -632,7 +633,7 @@ class Explorer:
         goal = least_unknown(self.map, goals)
         if may_look and hardly_seen(self.map, problem.start, goal):
             why = "too little of the space around the goal was seen free"
-            return self._context(problem, limit).fail(Status.NO_PATH, why)
+            return self._context(problem).fail(Status.NO_PATH, why)
         result = self._planned(replace(self._seen_free(problem, goal), goal=JointGoal(goal[None])), limit)
         if result.solved:
             return result
@@ -678,9 +679,9 @@ class Explorer:
             lost = np.pad(lost_regions(self._views.volume()), ((0, 0), (0, 0), (LAYERS_BELOW, 0)))
         return UnknownSpace(self.robot, ends, self.map.unknown, predicted, 0.0, MAP, lost)
 
-    def _planned(self, problem: Problem, limit: float, seed: int | None = None) -> PlanResult:
+    def _planned(self, problem: Problem, limit: float, attempt: int = 0) -> PlanResult:
         compile_scene_for(self.robot, problem.scene)  # compile now, outside the time limit
-        return self._planner.plan(problem, limit, self._seed if seed is None else seed, FIRST)
+        return self._planner.plan(problem, limit, self._seed + attempt, FIRST)
 
     def _goals(self, problem: Problem) -> Configurations | PlanResult:
         """The goal configurations, or the result that says why there is none."""
@@ -688,7 +689,7 @@ class Explorer:
             return problem.goal.positions
         # with see_goal, a constant seed gives the same goals at each step, so that views add up
         seed = 0 if self.settings.see_goal else self._seed
-        usable = usable_start_goal(self._context(problem, self.settings.time_limit, seed))
+        usable = usable_start_goal(self._context(problem, seed))
         return usable if isinstance(usable, PlanResult) else np.stack(usable.goals)
 
     @locked

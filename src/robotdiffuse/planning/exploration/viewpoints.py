@@ -36,7 +36,6 @@ from robotdiffuse.core.types import (
     Pose,
     Value,
     Values,
-    Vector,
     arc_lengths,
     frozen_dataclass,
     interpolated,
@@ -143,21 +142,15 @@ def least_unknown(known: OccupancyMap, goals: Configurations) -> Configuration:
 def reaches_outside(robot: Robot, q: Configuration) -> bool:
     """Whether the arm reaches out of the map: the centers of some covering spheres of its moving links are
     outside."""
-    low, high = _corners_of_map()
     moving = [link for link in robot.spheres if robot.link_frame(link)]
     centers = [placed(robot.fk(q, link), robot.spheres[link][:, :3]) for link in moving]
-    return any(((points < low) | (points > high)).any() for points in centers)
-
-
-def _corners_of_map() -> tuple[Vector, Vector]:
-    """The low and the high corner of the map [m]."""
-    low = np.array(MAP.low)
-    return low, low + np.array(MAP.shape) * MAP.edge
+    return not all(MAP.contains(MAP.indices(points)).all() for points in centers)
 
 
 def _walls() -> Iterator[Box]:
     """Yields boxes around the map."""
-    low, high = _corners_of_map()
+    low = np.array(MAP.low)
+    high = low + np.array(MAP.shape) * MAP.edge
     for axis in range(3):
         for at, name in ((low[axis] - WALL / 2, "before"), (high[axis] + WALL / 2, "beyond")):
             center = (low + high) / 2

@@ -36,6 +36,7 @@ from robotdiffuse.core.types import (
     Tree,
     Values,
     for_kernels,
+    nearest_first,
 )
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
 from robotdiffuse.planning.context import DEFAULT_CLEARANCE, TOLERANCE_FRACTION, PlanningContext
@@ -398,7 +399,7 @@ class AnytimeSearch:
     def _try_straight_lines(self) -> None:
         if not self._shortens:
             return
-        for goal in self.goals[np.argsort(self.straight, kind="stable")]:
+        for goal in nearest_first(self.goals, self.start):
             path = self._line(goal)
             if len(path) and self.offer(path, self.line_stage):
                 self.found += 1
@@ -499,11 +500,11 @@ def usual_clearances(wanted: float) -> list[float]:
     above the default come first, then FALLING_FRACTIONS of the default. Clearances up to MIN_CLEARANCE are
     left out; MIN_CLEARANCE and 0 come last.
     """
-    falling = [fraction * wanted for fraction in FALLING_FRACTIONS]
+    lowest, later = MIN_CLEARANCE, [MIN_CLEARANCE, 0.0]
     if wanted > DEFAULT_CLEARANCE:
-        usual = [fraction * DEFAULT_CLEARANCE for fraction in FALLING_FRACTIONS]
-        falling = [*(clearance for clearance in falling if clearance > DEFAULT_CLEARANCE), *usual]
-    return [*(clearance for clearance in falling if clearance > MIN_CLEARANCE), MIN_CLEARANCE, 0.0]
+        lowest, later = DEFAULT_CLEARANCE, usual_clearances(DEFAULT_CLEARANCE)
+    falling = (fraction * wanted for fraction in FALLING_FRACTIONS)
+    return [*(clearance for clearance in falling if clearance > lowest), *later]
 
 
 class _Validation:

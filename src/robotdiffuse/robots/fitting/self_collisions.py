@@ -117,12 +117,11 @@ class Links:
             poses[joint.child] = poses[joint.parent] @ T_parent_child
         return poses
 
-    def sphere_distance(self, poses: LinkPoses, a: str, b: str) -> Values:
-        """Signed distances [n] between the covering spheres of two links [m]: lower bounds of the distances
-        of the links' meshes. Where the bounding balls of the links' spheres are more than NEAR_DISTANCE
-        apart, the distance of these two balls is given."""
+    def touches(self, poses: LinkPoses, a: str, b: str, apart: float, least: float) -> tuple[Values, Points]:
+        """`deepest_touches` of the covering spheres of two links. The depths are upper bounds on how deep the
+        links' meshes overlap."""
         first, second = (for_kernels(self.robot.spheres[link]) for link in (a, b))
-        return -deepest_touches(poses[a], poses[b], first, second, NEAR_DISTANCE, -np.inf)[0]
+        return deepest_touches(poses[a], poses[b], first, second, apart, least)
 
     def _placed(self, poses: LinkPoses, a: str, b: str, i: int) -> tuple[Any, Any, ndarray]:
         """Coal poses of two links in configuration i, and the distances [a, b] between the balls around their
@@ -178,8 +177,8 @@ class Links:
         return part_gaps
 
 
-def _distance(a: "coal.Convex", T_a: Any, b: "coal.Convex", T_b: Any) -> float:
-    """Signed distance of two convex parts at their poses [m]."""
+def _distance(a: "coal.CollisionGeometry", T_a: Any, b: "coal.CollisionGeometry", T_b: Any) -> float:
+    """Signed distance of two solids or surfaces at their poses [m]."""
     return coal.distance(a, T_a, b, T_b, coal.DistanceRequest(), coal.DistanceResult())
 
 
@@ -200,7 +199,7 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
     names = tuple(robot.joint_names[joint] for joint in joints)
     far = max(pair, key=robot.link_frame)
     lever = radii_of(robot, [far])[0, joints]
-    slides = np.array(robot.prismatic)[joints]
+    slides = robot.prismatic[joints]
     lower = robot.lower[joints]
     upper = robot.upper[joints]
     upper = np.where(slides, upper, np.minimum(upper, lower + TURN))
@@ -355,7 +354,8 @@ def find_allowed_collisions(
     reports = []
     first = {link: T[: max(int(len(q) * ADJACENT_SHARE), 1)] for link, T in poses.items()}
     for a, b in moving_pairs(robot, robot.meshes):
-        sphere_distances = links.sphere_distance(first if frozenset((a, b)) in adjacent else poses, a, b)
+        tested = first if frozenset((a, b)) in adjacent else poses
+        sphere_distances = -links.touches(tested, a, b, NEAR_DISTANCE, -np.inf)[0]
         colliding = np.zeros(len(sphere_distances), dtype=bool)
         for i in np.flatnonzero(sphere_distances <= 0):
             colliding[i] = links.collide(poses, a, b, int(i))
@@ -485,8 +485,7 @@ def measure_false_collisions(
     }
     collisions = []
     for a, b in robot.checked_pairs():
-        first, second = (for_kernels(robot.spheres[link]) for link in (a, b))
-        depth, middle = deepest_touches(poses[a], poses[b], first, second, 0.0, 0.0)
+        depth, middle = links.touches(poses, a, b, 0.0, 0.0)
         spheres = depth > 0
         for table in robot.tables:
             if {*table.links} == {a, b}:
@@ -551,17 +550,11 @@ def _sticking_out(
     and in the link's frame [m]. Each place is listed only for the link whose true surface is farther from the
     place."""
     places_by_link: dict[str, list[ndarray]] = {link: [] for link in pair}
-    request = coal.DistanceRequest()
     point = coal.Sphere(1e-6)
     for i in rows:
         for at in links.contacts(poses, *pair, int(i)):
             far = [
-                min(
-                    coal.distance(
-                        point, coal.Transform3s(np.eye(3), at), tree, place, request, coal.DistanceResult()
-                    )
-                    for tree in trees[link]
-                )
+                min(_distance(point, coal.Transform3s(np.eye(3), at), tree, place) for tree in trees[link])
                 for link, place in ((link, coal_pose(poses[link][i])) for link in pair)
             ]
             link = pair[int(np.argmax(far))]

@@ -6,6 +6,7 @@ are no jaxtyping annotations because Numba compiles these functions. Lengths are
 """
 
 import math
+from itertools import product
 
 import numpy as np
 
@@ -25,9 +26,7 @@ MIN_GAIN = 1e-7
 """Steps that reduce the excess by less than this are not taken [m]."""
 
 # Unit vectors to the 26 neighbors of a voxel: the directions of the steps in the search for a center.
-DIRECTIONS = np.array(
-    [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], dtype=np.float64
-)
+DIRECTIONS = np.array([*filter(any, product((-1, 0, 1), repeat=3))], dtype=np.float64)
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 

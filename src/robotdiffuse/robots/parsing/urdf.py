@@ -749,12 +749,13 @@ def _fields(file: str, joint: str, entry: object) -> dict[str, float]:
 
 
 def _changed(joint: Joint, fields: dict[str, float]) -> Joint:
-    default = joint.acceleration == ACCELERATION_PER_VELOCITY * joint.velocity  # a new joint has zeros
-    if "velocity" in fields and "acceleration" not in fields and default:
-        fields = fields | {"acceleration": ACCELERATION_PER_VELOCITY * fields["velocity"]}
-    default = joint.jerk == JERK_PER_ACCELERATION * joint.acceleration
-    if "acceleration" in fields and "jerk" not in fields and default:
-        fields = fields | {"jerk": JERK_PER_ACCELERATION * fields["acceleration"]}
+    for rate, following, ratio in (
+        ("velocity", "acceleration", ACCELERATION_PER_VELOCITY),
+        ("acceleration", "jerk", JERK_PER_ACCELERATION),
+    ):
+        default = getattr(joint, following) == ratio * getattr(joint, rate)  # a new joint has zeros
+        if rate in fields and following not in fields and default:
+            fields = fields | {following: ratio * fields[rate]}
     if joint.kind == "continuous" and {"lower", "upper"} & fields.keys():
         joint = replace(joint, kind="revolute", lower=-math.pi, upper=math.pi)
     joint = replace(joint, **fields)
