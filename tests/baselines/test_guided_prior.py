@@ -242,4 +242,4 @@ def test_bad_settings() -> None:
     refuses(r"model.encoder is pointnet and encoder_settings are", replace, SMALL, encoder="pointnet")
     refuses(r"denoiser is encoder_decoder", replace, SMALL, denoiser="encoder_decoder")
     refuses(r"target is limits and smooth_noise is True", replace, TRAINING, smooth_noise=True)
-    refuses(r"edmp.samples is 11 and guides are 12", guided_prior.EDMPSettings, samples=11)
+    refuses(r"edmp.samples is 11; it must be at least 12, one for each guide", guided_prior.EDMPSettings, samples=11)

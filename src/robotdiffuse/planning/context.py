@@ -161,7 +161,7 @@ class PlanningContext:
         """Notes of the result: what was changed or ignored."""
         self._prepared = 0.0
         """When the search began [s since the call]; 0 before."""
-        self._progress: list[tuple[float, float]] = []
+        self._progress = list[tuple[float, float]]()
         self._refused = ""
         self.refused_at = 0.0, ""
         """The first violation of the last motion that was refused: where it is, as a fraction of the motion,

@@ -251,7 +251,7 @@ def ever_finer(context: PlanningContext, settings: PlannerSettings) -> Iterator[
 def one_of_each(scene: Scene) -> Scene:
     """A scene with the first shape of each kind; meshes are reduced to one triangle and point clouds to one
     point."""
-    shapes: dict[str, Shape] = {}
+    shapes = dict[str, Shape]()
     for shape in scene.shapes:
         if isinstance(shape, Mesh):
             shape = Mesh(shape.vertices[shape.faces[0]], [[0, 1, 2]], shape.xyz, shape.wxyz)

@@ -119,7 +119,7 @@ def _from_urdf(urdf: Path) -> Robot:
     source = str(urdf.resolve())
     digest = tree.digest
     srdf = tree.srdf_digest
-    robots: dict[str, Robot] = {}
+    robots = dict[str, Robot]()
     outdated = list[str]()
     for name, folder in _added().items():
         try:

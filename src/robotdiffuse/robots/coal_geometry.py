@@ -43,6 +43,6 @@ def coal_surface(vertices: Points, faces: Integer[ndarray, "f 3"]) -> coal.BVHMo
     model = coal.BVHModelOBBRSS()
     model.beginModel(len(faces), len(vertices))
     model.addVertices(np.ascontiguousarray(vertices))
-    model.addTriangles(np.ascontiguousarray(faces, dtype=np.int32))
+    model.addTriangles(np.ascontiguousarray(faces, np.int32))
     model.endModel()
     return model

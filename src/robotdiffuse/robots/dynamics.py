@@ -137,9 +137,9 @@ class Dynamics:
         # From the base to the tips, for each frame: its rate of rotation (by the fraction of the stretch),
         # its angular velocity omega and angular acceleration alpha (by time), and the acceleration of its
         # origin. The base accelerates upwards in place of gravity.
-        frames: list[tuple[Jet, Jet, Jet, Jet]] = []
-        axes: list[Jet] = []
-        arms: list[Jet] = []
+        frames = list[tuple[Jet, Jet, Jet, Jet]]()
+        axes = list[Jet]()
+        arms = list[Jet]()
         for j, body in enumerate(bodies):
             rotation, omega, alpha, linear = (
                 frames[body.parent] if body.parent >= 0 else (still, still, still, weight)

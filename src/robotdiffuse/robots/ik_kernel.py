@@ -210,7 +210,7 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
     A = np.zeros((6, 6))
     y = np.zeros(6)
     step = np.zeros(dof)
-    held = np.zeros(dof, dtype=np.bool_)
+    held = np.zeros(dof, np.bool_)
     trial = np.empty(dof)
     solutions = np.empty((len(known) + wanted, dof))
     solutions[: len(known)] = known

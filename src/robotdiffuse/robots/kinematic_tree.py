@@ -127,7 +127,7 @@ TURN = 2 * np.pi
 
 def chain(above: dict[str, Joint], link: str) -> list[Joint]:
     """The joints from the base to a link; `above` maps links to their parent joints."""
-    joints: list[Joint] = []
+    joints = list[Joint]()
     while link in above:
         joints.append(above[link])
         link = above[link].parent
@@ -193,7 +193,7 @@ class KinematicTree(Value):
     def planned_joints(self) -> tuple[Joint, ...]:
         """Movable, unlocked joints between the base and the tips, in depth-first order."""
         chains = [self.joints_above(link) for link in self.tips]
-        first: dict[str, int] = {}
+        first = dict[str, int]()
         for i, chain in enumerate(chains):
             for joint in chain:
                 first.setdefault(joint.name, i)
@@ -348,7 +348,7 @@ class KinematicTree(Value):
     @cached_property
     def moved_by(self) -> Bool[ndarray, "frames dof"]:
         """Which planned joints move which frames."""
-        rows = np.zeros((self.dof + 1, self.dof), dtype=bool)
+        rows = np.zeros((self.dof + 1, self.dof), bool)
         for j, parent in enumerate(self.parents):
             rows[j + 1] = rows[parent]
             rows[j + 1, j] = True

@@ -46,7 +46,7 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
     links = [link for link in robot.link_names if link in robot.spheres]
     bare_radii = motion_radii(robot.bare) if robot.bare is not None else np.zeros((0, robot.dof))
     links = links[len(bare_radii) :]  # without those of the bare robot, which come first
-    frames = np.array([robot.link_frame(link) for link in links], dtype=int)
+    frames = np.array([robot.link_frame(link) for link in links], int)
     radii = np.zeros((len(links), robot.dof))
     directions = _directions()
     directions_by_row = np.ascontiguousarray(directions.transpose(0, 2, 1))

@@ -70,7 +70,7 @@ class LinkPairTable(Value):
 
     def at(self, *values: Values) -> Mask:
         """Whether the links are known to be apart at joint values; `values` are one array [n] per joint."""
-        inside = np.ones(len(values[0]), dtype=bool)
+        inside = np.ones(len(values[0]), bool)
         index = []
         for axis, value in enumerate(values):
             cell = self._cell(axis, value)
@@ -110,7 +110,7 @@ class LinkPairTable(Value):
         steps = np.arange((last - first).max(initial=0) + 1)
         cell = np.minimum(first[:, None] + steps, last[:, None])
         cell = cell % count if self._whole(axis) else np.clip(cell, 0, count - 1)
-        overlaps = np.zeros((len(low), count), dtype=bool)
+        overlaps = np.zeros((len(low), count), bool)
         np.put_along_axis(overlaps, cell, True, axis=1)
         return overlaps
 

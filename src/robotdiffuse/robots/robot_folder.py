@@ -113,7 +113,7 @@ def _npz(arrays: dict[str, ndarray]) -> bytes:
 def read_robot_folder(folder: Path) -> Robot:
     """Read the robot in a folder; raises InputError that names the file if one is missing or damaged."""
     data = _read_json(folder / ROBOT_FILE)
-    meshes: dict[str, tuple[ConvexMesh, ...]] = {}
+    meshes = dict[str, tuple[ConvexMesh, ...]]()
     arrays = read_arrays(folder / MESH_FILE)
     with reading(folder / MESH_FILE):
         for link, mesh in _unpacked(arrays, ConvexMesh):
@@ -306,7 +306,7 @@ def _pose_from_json(data: dict, what: str) -> Float[ndarray, "4 4"]:
 
 
 def _array(rows: object, width: int, what: str) -> Float[ndarray, "n w"]:
-    array = np.asarray(rows, dtype=np.float64)
+    array = np.asarray(rows, np.float64)
     if array.ndim != 2 or array.shape[1] != width or not within(array):
         raise ValueError(f"{what}: {width} finite numbers within ±{MAX_COORDINATE:g} in each row expected")
     return array
@@ -315,7 +315,7 @@ def _array(rows: object, width: int, what: str) -> Float[ndarray, "n w"]:
 def _packed(meshes: Sequence[tuple[str, Surface]]) -> dict[str, ndarray]:
     """Meshes of links, joined in four arrays, which are read faster than many small ones."""
     return {
-        "links": np.array([link for link, _ in meshes], dtype=np.str_),
+        "links": np.array([link for link, _ in meshes], np.str_),
         "sizes": np.array([(len(mesh.vertices), len(mesh.faces)) for _, mesh in meshes], np.int64).reshape(
             -1, 2
         ),

@@ -37,7 +37,7 @@ def load_visual(robot: Robot) -> dict[str, tuple[VisualMesh, ...]]:
     smaller.
     """
     bundled = _read_bundled(robot.name)
-    meshes: dict[str, tuple[VisualMesh, ...]] = {}
+    meshes = dict[str, tuple[VisualMesh, ...]]()
     colors = {body.name: TOOL_COLOR if body.tool else HELD_COLOR for body in robot.attached}
     for link in robot.link_names:
         collision = _collision_geometry(robot, link, colors.get(link, LINK_COLOR))

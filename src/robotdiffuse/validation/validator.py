@@ -345,9 +345,9 @@ class Verifier:
                 return replace(report, scene_clearance=float(scene), self_clearance=float(itself))
             chord = CHORD_MARGIN * float(joint_bounds.max()) * allowed / reduction
 
-    def collision_free(self, path: Path) -> bool:
-        """Whether a path is certified free of collision and proved to keep the path constraints. Start, goal
-        and limits are not checked."""
+    def collision_free(self, path: Path | Trajectory) -> bool:
+        """Whether a path, or the polyline through the rows of a motion, is certified free of collision and
+        proved to keep the path constraints. Start, goal and limits are not checked."""
         self._check_shape("path", path)
         if self.constraints is not None and self.constraints.first_violation(path.positions) is not None:
             return False

@@ -259,7 +259,7 @@ class Explorer:
         """The voxels that views since `set_goal` should have shown."""
         self._way_in: Configurations | None = None
         """Waypoints of the latest motion that was returned."""
-        self._news: list[DepthView] = []
+        self._news = list[DepthView]()
         """Views since the latest step."""
         self._fixed_view: DepthView | None = None
         """The last view of a camera that is not on the arm, between the last two calls of `next`."""
@@ -415,8 +415,7 @@ class Explorer:
         if violation is None:
             return None
         stop = braked(robot, motion, time)
-        certified = validator.collision_free(Path(robot.joint_names, stop.positions))
-        return Stop(time, stop, violation.message, certified)
+        return Stop(time, stop, violation.message, validator.collision_free(stop))
 
     def _step(self, problem: Problem, policy: str) -> Step:
         if policy == STRICT and isinstance(problem.goal, JointGoal):

@@ -89,8 +89,8 @@ class RecordedExplorer(Explorer):
     def __init__(self, *values: Any, **named: Any) -> None:
         """See `Explorer`."""
         super().__init__(*values, **named)
-        self.views: list[RecordedView] = []
-        self.steps: list[RecordedStep] = []
+        self.views = list[RecordedView]()
+        self.steps = list[RecordedStep]()
 
     @property
     def duration(self) -> float:

@@ -180,9 +180,9 @@ class GoalSeen:
         self._known = known
         self._views = views
         self._required = required
-        self._unseen: dict[tuple[float, ...], Points] = {}
+        self._unseen = dict[tuple[float, ...], Points]()
         """Centers of the balls that no view has shown to be free, by configuration [m]."""
-        self.taken: list[Configuration] = []
+        self.taken = list[Configuration]()
         """Configurations of the views since the goal was set."""
 
     def forget(self) -> None:

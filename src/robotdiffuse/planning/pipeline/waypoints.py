@@ -69,7 +69,7 @@ def plan_through_waypoints(planner: Solver, problem: Problem, request: PlanReque
     attempts = 0
     failure: tuple[int, PlanResult] | None = None
     while True:
-        segments: list[PlanResult] = []
+        segments = list[PlanResult]()
         start = problem.start
         for k, goal in enumerate(goals):
             segment_limit = max(request.time_limit - context.elapsed, MIN_TIME_LIMIT) / (len(goals) - k)

@@ -151,15 +151,11 @@ class TimedPath:
         contact = max(jerk_filter.displacement, DEFAULT.contact)
         with_clearance = verifier(validator.problem, replace(DEFAULT, contact=contact))
 
-        def free(motion: Trajectory) -> bool:
-            return validator.collision_free(Path(motion.joint_names, motion.positions))
-
         def free_around(q: Configurations) -> bool:
             return with_clearance.collision_free(Path(robot.joint_names, q))
 
-        rows, deviations, _ = time_parameterize(
-            robot, path, free, validator.collision_free, keeps=free_around
-        )
+        free = validator.collision_free
+        rows, deviations, _ = time_parameterize(robot, path, free, free, keeps=free_around)
         line = rounded_line(rows, deviations)
         for i in np.flatnonzero(deviations):
             if not free_around(

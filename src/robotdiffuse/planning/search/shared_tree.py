@@ -324,7 +324,7 @@ class SharedTreeSearch:
         self.goals = goals.astype(np.float32)
         self.tree = rrt_kernel.make_trees(self.start, self.goals[:0], CAPACITY)
         self.targets = make_goals(self.start, self.goals)
-        self.costs: list[float] = []
+        self.costs = list[float]()
         """The best cost after each round [rad], infinite while there is no path."""
         self._longest = np.float32(settings.range)
         self._state = state

@@ -101,7 +101,7 @@ class DistanceGrid(NamedTuple):
         pitch = max(float(np.prod(size) / voxels) ** (1 / 3), size.max() / 300, finest)
         origin = low - 2.5 * pitch
         shape = np.ceil((high - origin) / pitch).astype(int) + 3
-        occupied = np.zeros(shape, dtype=bool)
+        occupied = np.zeros(shape, bool)
         for soup in soups:
             voxels_of = ((split(soup, pitch / 2).reshape(-1, 3) - origin) / pitch).astype(int)
             occupied[tuple(voxels_of.T)] = True

@@ -117,7 +117,7 @@ def _around(points: Points) -> Float[ndarray, "4"]:
 def body_geometry(body: AttachedBody) -> tuple[tuple[ConvexMesh, ...], Spheres]:
     """Convex meshes of a body and spheres [x y z radius, m] that cover them, in the body's frame."""
     T_body_link = inverse(body.T_link_body)
-    meshes: list[ConvexMesh] = []
+    meshes = list[ConvexMesh]()
     spheres: list[ndarray] = [np.zeros((0, 4))]
     for shape in body.shapes:
         T_link_shape, parts = shape.solid()

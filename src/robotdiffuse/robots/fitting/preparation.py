@@ -40,7 +40,6 @@ from robotdiffuse.robots.fitting.self_collisions import (
 from robotdiffuse.robots.fitting.sphere_fitting import (
     FLOOR_TOLERANCE,
     Bounds,
-    Planes,
     Solid,
     SphereSettings,
     covered,
@@ -106,17 +105,18 @@ def neighbors(robot: Robot, link: str) -> tuple[Neighbor, ...]:
 def hidden_by_neighbors(robot: Robot, link: str) -> Callable[[Points], Mask]:
     """A function that tells which points, in the link's frame [m], are inside a neighbor at all values of the
     joint between the link and this neighbor."""
-    neighbor_planes: list[tuple[Neighbor, tuple[ndarray, ndarray], Planes]] = []
-    for near_link in neighbors(robot, link):
-        corners = np.concatenate([mesh.vertices for mesh in robot.meshes[near_link.link]])
+    neighbor_planes = []
+    for name, poses in neighbors(robot, link):
+        meshes = robot.meshes[name]
+        corners = np.concatenate([mesh.vertices for mesh in meshes])
         box = corners.min(0) - BOX_PADDING, corners.max(0) + BOX_PADDING
-        neighbor_planes.append((near_link, box, stacked_planes(robot.meshes[near_link.link])))
+        neighbor_planes.append((poses, *box, stacked_planes(meshes)))
 
     def hidden(points: Points) -> Mask:
-        hidden_points = np.zeros(len(points), dtype=bool)
-        for near_link, (low, high), planes in neighbor_planes:
+        hidden_points = np.zeros(len(points), bool)
+        for T_link_neighbor, low, high, planes in neighbor_planes:
             candidates = np.flatnonzero(~hidden_points)
-            for T in near_link.T_link_neighbor:
+            for T in T_link_neighbor:
                 local = seen_from(T, points[candidates])
                 in_box = ((local >= low) & (local <= high)).all(axis=1)
                 candidates = candidates[in_box]

@@ -209,7 +209,7 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
     # Boxes of joint values, in units of the table's cells. All boxes have the same `size`, which is halved
     # along one joint per iteration. Each row of `low` is the lower corner of a box, and the column of `parts`
     # with the same index is a pair of parts that may touch in the box.
-    separated = np.ones((CELLS,) * len(joints), dtype=bool)
+    separated = np.ones((CELLS,) * len(joints), bool)
     size = np.full(len(joints), float(CELLS))
     parts = np.indices([len(robot.meshes[link]) for link in pair]).reshape(2, -1)
     low = np.zeros((parts.shape[1], len(joints)))
@@ -356,7 +356,7 @@ def find_allowed_collisions(
     for a, b in moving_pairs(robot, robot.meshes):
         tested = first if frozenset((a, b)) in adjacent else poses
         sphere_distances = -links.touches(tested, a, b, NEAR_DISTANCE, -np.inf)[0]
-        colliding = np.zeros(len(sphere_distances), dtype=bool)
+        colliding = np.zeros(len(sphere_distances), bool)
         for i in np.flatnonzero(sphere_distances <= 0):
             colliding[i] = links.collide(poses, a, b, int(i))
         reports.append(PairReport((a, b), reason(a, b, sphere_distances, colliding), float(colliding.mean())))
@@ -490,8 +490,8 @@ def measure_false_collisions(
         for table in robot.tables:
             if {*table.links} == {a, b}:
                 spheres &= ~table.at(*(q[:, column[name]] for name in table.joints))
-        parts = np.zeros(samples, dtype=bool)
-        meshes = np.zeros(samples, dtype=bool)
+        parts = np.zeros(samples, bool)
+        meshes = np.zeros(samples, bool)
         for i in np.flatnonzero(spheres):
             parts[i] = links.collide(poses, a, b, int(i))
             if parts[i]:

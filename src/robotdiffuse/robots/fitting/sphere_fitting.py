@@ -362,7 +362,7 @@ class Cells(NamedTuple):
         planes = [stacked_planes((mesh,)) for mesh in solid.meshes]
         for k, mesh in enumerate(solid.meshes):
             triangles = split(mesh.triangles, size)
-            hidden = np.zeros(len(triangles), dtype=bool)
+            hidden = np.zeros(len(triangles), bool)
             for mesh_planes in (*planes[:k], *planes[k + 1 :]):
                 hidden |= is_inside(triangles.reshape(-1, 3), mesh_planes, BURIED_DEPTH).reshape(-1, 3).all(1)
             triangles = triangles[~hidden]
@@ -382,7 +382,7 @@ class Cells(NamedTuple):
         _, first, index = np.unique(lattice @ (1, 2**21, 2**42), return_index=True, return_inverse=True)
         count = len(points) - len(corners)
         points = points[first]
-        sharp = np.zeros(len(points), dtype=bool)
+        sharp = np.zeros(len(points), bool)
         sharp[index.ravel()[:count]] = True
         # if triangles are left out or split to different sizes, any point may be a corner of the surface
         sharp |= irregular
@@ -398,7 +398,7 @@ class Cells(NamedTuple):
     def part(self, mine: Mask) -> "Cells":
         """The cells in the mask `mine`. Points that other cells share count as sharp, since some of their
         neighbors are missing in the part."""
-        outside = np.zeros(len(self.points), dtype=bool)
+        outside = np.zeros(len(self.points), bool)
         outside[self.corners[~mine]] = True
         used, index = np.unique(self.corners[mine], return_inverse=True)
         return Cells(self.points[used], index.reshape(-1, 3), (self.sharp | outside)[used])
@@ -446,7 +446,7 @@ def _thin_out(sizes: SphereSizeGrid, cells: Cells, centers: Points, settings: Sp
     When a sphere is dropped, only the spheres that take over its cells are moved.
     """
     max_excess = sizes.spacing * EXCESS_TOLERANCE
-    centers, required = centers.copy(), np.zeros(len(centers), dtype=bool)
+    centers, required = centers.copy(), np.zeros(len(centers), bool)
     while len(centers) > 1:
         owner, _, runner_up, second_excess = cells.assigned(sizes, centers)
         loss = np.full(len(centers), -np.inf)
@@ -461,7 +461,7 @@ def _thin_out(sizes: SphereSizeGrid, cells: Cells, centers: Points, settings: Sp
             if not len(takers):  # sphere i has no cells
                 dropped[i] = True
                 continue
-            affected = np.zeros(len(centers), dtype=bool)
+            affected = np.zeros(len(centers), bool)
             affected[i] = affected[takers] = True
             part = cells.part(affected[owner])
             new_centers, excess = _relax(sizes, part, centers[takers], settings.rounds, max_excess)

@@ -131,9 +131,9 @@ class ConvertedModel:
         self.bodies = robot_bodies(model)
         self.held = placing_joints(model, self.bodies)
         self.colliding = colliding_geoms(model)
-        self.notes: list[str] = []
-        self.links: set[str] = set()
-        self.meshes: dict[str, str] = {}
+        self.notes = list[str]()
+        self.links = set[str]()
+        self.meshes = dict[str, str]()
 
         if not self.bodies:
             raise InputError(
@@ -253,7 +253,7 @@ class ConvertedModel:
             for k in range(model.ntendon)
             if model.tendon_limited[k]
         ]
-        mimics: dict[int, dict[str, str]] = {}
+        mimics = dict[int, dict[str, str]]()
         movable = {*_joints_of(model, self.bodies)} - self.held
         for k in range(model.neq):
             if not model.eq_active0[k]:

@@ -153,7 +153,7 @@ def read_srdf(file: str | Path) -> Srdf:
         return value
 
     virtual = names(root, "virtual_joint")  # they connect the root to the world
-    poses: dict[str, dict[str, float]] = {}
+    poses = dict[str, dict[str, float]]()
     for state in root.findall("group_state"):
         values = {text(joint, "name"): number(joint) for joint in state.findall("joint")}
         poses.setdefault(text(state, "name"), {}).update(values)
@@ -235,12 +235,12 @@ class JointTree:
     def __init__(self, base: str, joints: list[Joint]) -> None:
         """`joints` are all joints below the base, parents before children, as in `Robot.joints`."""
         self.base = base
-        self.below: dict[str, list[Joint]] = {}
-        self.moving: dict[str, int] = {}
+        self.below = dict[str, list[Joint]]()
+        self.moving = dict[str, int]()
         """Largest number of independent movable joints in a chain below each link."""
-        self.roots: set[str] = set()
+        self.roots = set[str]()
         """Links with a movable joint below them, mimic joints included."""
-        self._depth: dict[str, int] = {}
+        self._depth = dict[str, int]()
         """Number of joints in the longest chain below each link."""
         for joint in joints:
             self.below.setdefault(joint.parent, []).append(joint)

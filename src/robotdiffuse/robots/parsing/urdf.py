@@ -100,7 +100,7 @@ class UrdfTree:
         file is compiled, which runs code in it; otherwise, a xacro file raises InputError."""
         self.path = path
         self.packages = Packages(path, folders)
-        self.notes: list[str] = []
+        self.notes = list[str]()
         self.semantics: Srdf | None = None
         """Named poses and allowed pairs of a MuJoCo model."""
         self.unlimited = set[str]()
@@ -108,7 +108,7 @@ class UrdfTree:
         self.unranged = set[str]()
         """Joints without limits of position, such as wheels; they are planned only if the argument
         `limits` of the method `robot` gives position limits, and can be held at any value."""
-        self._surfaces: dict[str, tuple[Surface, ...]] = {}
+        self._surfaces = dict[str, tuple[Surface, ...]]()
 
         def parsed(text: bytes) -> ET.Element:
             self.text = with_prefixes(text)
@@ -151,10 +151,10 @@ class UrdfTree:
         """Tag of the elements that are read as collision geometry: "visual" only if no link has
         "collision"."""
         self.elements = self._named(root, "joint")
-        self.parents: dict[str, str] = {}
+        self.parents = dict[str, str]()
         """Parent joint of each link except the root."""
-        self.children: dict[str, list[str]] = {}
-        self.ends: dict[str, tuple[str, str]] = {}
+        self.children = dict[str, list[str]]()
+        self.ends = dict[str, tuple[str, str]]()
         """Parent and child link of each joint."""
         for name, element in self.elements.items():
             parent = self._end(name, element, "parent")
@@ -334,7 +334,7 @@ class UrdfTree:
     def _named(self, root: ET.Element, what: str) -> dict[str, ET.Element]:
         """The links or joints by name. Raises InputError for missing or repeated names, and for elements in
         SINGLE that appear more than once."""
-        elements: dict[str, ET.Element] = {}
+        elements = dict[str, ET.Element]()
         for element in root.findall(what):
             name = element.get("name")
             if not name:
@@ -359,7 +359,7 @@ class UrdfTree:
 
     def below(self, link: str) -> list[Joint]:
         """Joints below a link, parents before children."""
-        joints: list[Joint] = []
+        joints = list[Joint]()
         for name in self.children.get(link, []):
             joints.append(self._joint(name))
             joints += self.below(joints[-1].child)
@@ -367,7 +367,7 @@ class UrdfTree:
 
     def above(self, link: str) -> dict[str, Pose]:
         """T_link_ancestor of each ancestor that fixed joints alone connect to the link."""
-        transforms: dict[str, ndarray] = {}
+        transforms = dict[str, ndarray]()
         T_link_ancestor = np.eye(4)
         while link in self.parents:
             name = self.parents[link]
@@ -386,7 +386,7 @@ class UrdfTree:
         joint, or three joints that move in a plane. Then it is the link after these joints. Only joints from
         the root to `link` are considered.
         """
-        joints: list[str] = []  # from the root to `link`
+        joints = list[str]()  # from the root to `link`
         end = link
         while end in self.parents:
             joints.insert(0, self.parents[end])
@@ -725,7 +725,7 @@ def with_limits(robot: Robot, limits: Mapping[str, dict[str, float]]) -> Robot:
 def _fields(file: str, joint: str, entry: object) -> dict[str, float]:
     if not isinstance(entry, dict):
         raise InputError(f"{file}: joint_limits of {joint} is {shown(entry)}; it must be a mapping")
-    fields: dict[str, float] = {}
+    fields = dict[str, float]()
     for key, value in entry.items():
         # flags of MoveIt, such as has_jerk_limits
         if str(key).startswith("has_") or key == "angle_wraparound":
