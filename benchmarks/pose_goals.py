@@ -57,7 +57,7 @@ def nearest_distance(
     continuous = np.array(robot.continuous)
     lower = np.where(continuous, -np.inf, robot.lower)
     upper = np.where(continuous, np.inf, robot.upper)
-    half_turn = np.where(np.array(robot.prismatic), np.inf, np.pi)
+    half_turn = np.where(robot.prismatic, np.inf, np.pi)
     q = rng.uniform(
         np.maximum(lower, start - half_turn), np.minimum(upper, start + half_turn), (SEEDS, robot.dof)
     )

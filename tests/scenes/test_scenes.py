@@ -242,8 +242,10 @@ def test_a_cut_ply_mesh_is_refused(tmp_path: Path) -> None:
     stl: Any = trimesh.creation.box().export(file_type="stl")
     (tmp_path / "cut.stl").write_bytes(stl[:-30])
     refuses("it has 654 of the 684 bytes that its header states", read_triangles, tmp_path / "cut.stl")
+    capitals: Any = trimesh.creation.box().export(file_type="stl_ascii")
+    (tmp_path / "capitals.stl").write_text(capitals.upper())
     (tmp_path / "long.stl").write_bytes(stl + b"xx")
-    assert len(read_triangles(tmp_path / "long.stl")[1]) == 12
+    assert all(len(read_triangles(tmp_path / f"{name}.stl")[1]) == 12 for name in ("capitals", "long"))
 
 
 @pytest.mark.parametrize(

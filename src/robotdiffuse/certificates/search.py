@@ -257,7 +257,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         # moving_margins[SCENE] is that of a moving obstacle with the name "scene", if there is one
         margins[SCENE] = min(margins[SCENE], *moving_margins.values())
     record = None
-    with suppress(InputError):  # the robot may have been made in this program, and have no file
+    with suppress(InputError):  # the robot may have been made or changed in this program, and have no file
         # numbers in the world's frame would be rounded; only a payload's weight depends on the base's pose
         record = problem_record(problem if problem.payload else replace(problem, T_world_base=None))
     jerks = cubic_jerks(robot, motion)

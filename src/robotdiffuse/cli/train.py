@@ -143,7 +143,7 @@ def _print_report(figures: dict[str, float], out: str) -> None:
 
 MOTIONS = 60_000
 """Number of motions to generate: about twenty minutes on two cores. With rotated copies they are 360,000, and
-the training sees each seven times."""
+the config `compact` sees each seven times."""
 MIX = {"rop": 0.2, "rop_dense": 0.3, "shelf": 0.2, "crate": 0.15, "table": 0.15}
 """Fractions of the problem families. They contain more furniture than the data of the Panda's weights, since
 a network helps most there."""

@@ -89,7 +89,7 @@ def read_triangles(
             resolver = _buffer_resolver(path)
         if ending == ".ply":
             check_ply(content)
-        if ending == ".stl" and b"facet" not in content[:1000]:
+        if ending == ".stl" and b"facet" not in content[:1000].lower():
             end = 84 + 50 * int.from_bytes(content[80:84], "little")  # after the last triangle
             if len(content) < end:
                 raise InputError(f"it has {len(content):,} of the {end:,} bytes that its header states")

@@ -739,7 +739,8 @@ class PlanResult:
         Args:
             file: A .json file for the result and its problem, or a .csv file for the trajectory alone.
             problem: The content of a problem file; None: the result's own problem. If its robot is neither
-                bundled nor read from a file, the file holds no problem, and a note says so.
+                bundled nor read from a file, or was changed since, the file holds no problem, and a note says
+                so.
 
         Raises:
             InputError: For another ending, a file that cannot be written, .csv without a trajectory, and a

@@ -290,7 +290,7 @@ def write_mcap(problem: Problem, trajectory: Trajectory, file: Path) -> None:
         content = json.dumps(problem_record(problem)).encode()
         out.writer.add_attachment(0, 0, PROBLEM_ATTACHMENT, "application/json", content)
     except InputError:
-        pass  # a robot that was made in Python has no problem file
+        pass  # a robot that was made or changed in Python has no problem file
     poses = {link: robot.fk(trajectory.positions, link) for link in robot.link_names if link != robot.base}
     for i, t in enumerate(trajectory.times.tolist()):
         at = round(1e9 * t)

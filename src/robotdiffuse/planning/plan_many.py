@@ -139,7 +139,7 @@ def _planned(
                 reason = "the process of the planner died while planning this problem"
             if isinstance(error, NotStartedError):
                 reason = str(error)
-            yield calls[call], _error(arguments[0], problem, reason, request)
+            yield calls[call], replace(_error(arguments[0], problem, reason, request), problem=problem)
 
 
 def _planned_on_cluster(
@@ -170,8 +170,7 @@ def _plan_on_node(
 
 
 def _error(planner: str, problem: Problem, reason: str, request: PlanRequest) -> PlanResult:
-    failed = PlanResult(Status.ERROR, reason, planner, problem.robot.name, 0.0, request.seed)
-    return replace(failed, problem=problem)
+    return PlanResult(Status.ERROR, reason, planner, problem.robot.name, 0.0, request.seed)
 
 
 def _session(arguments: PlannerArguments, request: PlanRequest) -> Callable[[Problem], PlanResult]:

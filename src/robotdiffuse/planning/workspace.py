@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.core.errors import (
     InputError,
-    check_list,
     check_name,
     check_type,
     counted,
@@ -289,7 +288,8 @@ class Workspace:
             InputError: For anything but shapes, two shapes with equal names, and a shape with the name of a
                 held object.
         """
-        check_list("shapes", shapes, Shape, "shapes, each an argument of its own")
+        for i, shape in enumerate(shapes):
+            check_type(f"shapes[{i}]", shape, Shape, "a shape, each an argument of its own")
         new = Scene(shapes).moved(self._T_base_world).shapes
         names = [shape.name for shape in new]
         for body in self.robot.attached:

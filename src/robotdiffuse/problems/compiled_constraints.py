@@ -392,7 +392,7 @@ def _lever_bounds(robot: Robot, frame: str) -> JointValues:
     """For each joint of a frame's chain, in order, a bound of the distance from its axis to the frame's
     origin [m]; 1 for prismatic joints. Entries after the last joint of the chain are 0."""
     chain = list(robot.chain(frame))
-    slides = np.array(robot.prismatic)[chain]
+    slides = robot.prismatic[chain]
     # the validator lets joints exceed their limits a little
     travel = np.maximum(np.abs(robot.lower), np.abs(robot.upper))[chain] + 1e-3
     lengths = np.linalg.norm(robot.frame_offsets[chain, :3, 3], axis=1) + np.where(slides, travel, 0.0)

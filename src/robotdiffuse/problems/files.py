@@ -167,7 +167,8 @@ def problem_record(
         The content of a problem file.
 
     Raises:
-        InputError: For a robot that is neither bundled nor loaded from a file.
+        InputError: Without `robot`: for a robot that is neither bundled nor loaded from a file, or that was
+            changed since.
     """
     if robot is None:
         robot = problem.robot.source or problem.robot.name
@@ -177,9 +178,12 @@ def problem_record(
                 "robot"
             )
         arm = problem.robot.arm
-        if robot_fingerprint(load_robot(robot, dict(arm.locked))) != robot_fingerprint(arm):
+        loaded = load_robot(robot, dict(arm.locked))
+        if loaded is not arm and (
+            robot_fingerprint(loaded) != robot_fingerprint(arm) or (loaded.effort != arm.effort).any()
+        ):
             raise InputError(
-                f"robot was changed after it was read from {shown(robot)}; give its file as robot"
+                f"robot was changed after it was read from {shown(robot)}; give the file of the changed robot"
             )
     folder = None if folder is None else Path(folder)
     T = problem.T_world_base

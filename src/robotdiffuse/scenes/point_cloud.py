@@ -214,7 +214,8 @@ def _read_text(file: Path) -> ndarray:
             if line.lstrip()[0] not in "#/":
                 following = line
                 break
-            if {"x", "y", "z"} <= {*_names(line)}:  # of several comments, one may name the columns
+            # of several comments, one may name the columns
+            if first.lstrip()[0] in "#/" and {"x", "y", "z"} <= {*_names(line)}:
                 at, first = number, line
     names = _names(first)
     header = False

@@ -192,8 +192,8 @@ def _thinned(times: Values, positions: Configurations) -> tuple[Values, Configur
 
 
 def _track(obstacle: Drawable, motion: Path | Trajectory) -> list[list[float]]:
-    """The obstacle's motion relative to its first pose, in the base frame: rows of x y z and wxyz at evenly
-    spaced times of the robot's motion."""
+    """The obstacle's motion relative to its pose at time 0, in the base frame: rows of x y z and wxyz at
+    evenly spaced times of the robot's motion."""
     if not isinstance(motion, Trajectory):
         return [[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]
     count = int(min(MAX_ROWS, np.ceil(TRACK_RATE * motion.duration) + 1))
@@ -295,17 +295,16 @@ def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | N
 
     The arm is drawn at the start and at the goal. One of the two is see-through: in pictures the arm at the
     start, on pages the arm at the goal. Colliding links are red, and goal poses are drawn as axes. Of
-    several goals, the first free one is drawn; if none is free, the first one. Moving obstacles are drawn at
-    their first pose.
-    `result` gives the reason why there is no motion, shown if start and goal are free. Raises InputError for
-    a file name with another ending, or a file that cannot be written.
+    several goals, the first free one is drawn; if none is free, the first one. Moving obstacles are drawn
+    where they are at time 0. `result` gives the reason why there is no motion, shown if start and goal are
+    free. Raises InputError for a file name with another ending, or a file that cannot be written.
     """
     target = check_output(file, (".html", ".htm", ".png"))
     goal_configuration, validity = _goal_state(problem)
     validities = {"start": problem.is_free(problem.start), "goal": validity}
     states = np.stack([problem.start] if goal_configuration is None else [problem.start, goal_configuration])
     robot, scene = problem.robot_and_scene_in_world()
-    scene = added(scene, (moving.shape for moving in problem.moving_in_world))
+    scene = added(scene, (moving.at(0.0) for moving in problem.moving_in_world))
     T_world_base = IDENTITY if problem.T_world_base is None else problem.T_world_base
     poses = (pose for goal in goals_of(problem.goal) for pose in poses_of(goal))
     T_world_poses = [T_world_base @ pose.T_base_frame for pose in poses]

@@ -495,9 +495,9 @@ def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None
 
     Of the given poses, it is the one from which a camera with the intrinsics of the first view sees the
     largest share of the unknown voxels that the motion sweeps. Each voxel counts with the predicted
-    probability that it is occupied, times the probability that nothing hides it: neither seen or predicted
-    obstacles nor the arm at the start. With a policy other than "predicted", the first factor is the same for
-    all voxels.
+    probability that it is occupied, times the probability that nothing hides it: neither the known
+    scene, nor seen or predicted obstacles, nor the arm at the start. With a policy other than "predicted",
+    the first factor is the same for all voxels.
 
     Args:
         problem: A problem with views.

@@ -175,9 +175,10 @@ class TimedPath:
         count = max(int(self.line.length / LINE_INTERVAL), 8)
         grid = timing_grid(self.line, TimingSettings(line_intervals=count, corner_intervals=CORNER_INTERVALS))
         # s̈ is constant in an interval, and ṡ is 0 at the path's end, so an arm at rest in the last interval
-        # could not start. This interval is divided until its last part is within the tolerance of `end`.
+        # could not start. This interval is divided until its last part is within END_TOLERANCE of it;
+        # shorter parts would coincide in rounding.
         parts = (grid[-1] - grid[-2]) * 0.5 ** np.arange(1, 26)
-        grid = np.concatenate([grid[:-1], grid[-1] - parts[parts > 4e-10], grid[-1:]])
+        grid = np.concatenate([grid[:-1], grid[-1] - parts[parts > 0.4 * END_TOLERANCE], grid[-1:]])
         path = self.line(grid, 1), self.line(grid, 2), grid
         bounds = symmetric_bounds(self.acceleration, len(grid))
         return *path, controllable(*path, VELOCITY_FRACTION * self.robot.velocity, *bounds)
@@ -192,7 +193,7 @@ class TimedPath:
     @property
     def end(self) -> float:
         """A motion that reaches this s counts as being at the end of the path."""
-        return self.line.length - 1e-9
+        return self.line.length - END_TOLERANCE
 
     def at(self, s: float) -> Configuration:
         """The configuration at s."""
@@ -215,6 +216,8 @@ SHARE_FACTOR = 0.9
 """Factor by which accelerations are reduced, repeatedly, until MAX_DISPLACEMENT is kept."""
 GRID_TOLERANCE = 1e-4
 """A time counts as the next grid time if it is earlier by at most this fraction of a step."""
+END_TOLERANCE = 1e-9
+"""An arm that is this near to the end of its path counts as being there [rad]."""
 STILL = 1e-9
 """The arm rests if its last samples differ by less than this in each joint [rad]."""
 B_SPLINE = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
