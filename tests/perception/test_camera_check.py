@@ -18,7 +18,7 @@ from robotdiffuse.core.transforms import placed, pose, quaternion_from_rotation,
 from robotdiffuse.perception.camera_check import OPTICAL, agreement, camera_note
 from robotdiffuse.perception.depth_filter import pose_error
 from robotdiffuse.perception.depth_view import DepthNoise
-from robotdiffuse.perception.pose_refinement import PoseRefinement, mounted
+from robotdiffuse.perception.pose_refinement import PoseRefinement
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, render_depth
 from robotdiffuse.perception.visibility import surface_balls
 from robotdiffuse.planning.exploration.simulated import measured, taken, wrist_camera
@@ -208,7 +208,8 @@ def test_a_deviation_of_the_position_alone_is_refined_and_near_cameras_are_told_
     assert found.pose_deviation[0] < 0.017 and displaced(found, standing)[0].max() < 0.008
     beside = CAMERA.T_link_camera @ transform(np.array([-0.08, 0.0, 0.0]))
     mounts = [(CAMERA.link, CAMERA.T_link_camera), (CAMERA.link, beside)]
-    assert mounted(PANDA, mounts, PANDA.fk(HOME, CAMERA.link) @ beside, HOME) == 1
+    poses = PoseRefinement(PANDA, rd.Scene([FLOOR]), mounts)
+    assert poses.mount(PANDA.fk(HOME, CAMERA.link) @ beside, HOME) == 1
 
 
 def test_views_that_state_no_error_stay_as_they_are() -> None:

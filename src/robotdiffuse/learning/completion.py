@@ -59,7 +59,7 @@ class CompletionSettings(Settings, name="completion"):
 
 def voxel_centers() -> Float[ndarray, "56 56 32 3"]:
     """Centers of the voxels of an observed volume [m]."""
-    return COARSE.centers(np.argwhere(np.ones(SHAPE))).reshape(*SHAPE, 3)
+    return COARSE.all_centers.reshape(*SHAPE, 3)
 
 
 def reachable() -> Bool[ndarray, "56 56 32"]:

@@ -328,6 +328,12 @@ class PoseRefinement:
         T = view.T_base_camera @ _pose(camera.error)
         return replace(view, T_base_camera=T, pose_deviation=_deviation(view, T, camera.covariance))
 
+    def mount(self, T: Pose, q: Configuration) -> int | None:
+        """The index of the camera on the arm that is nearest to T = T_base_camera; None if it differs by
+        SAME_CAMERA or more."""
+        off = [float(np.abs(T - self._robot.fk(q, link) @ nominal).max()) for link, nominal in self._on_arm]
+        return int(np.argmin(off)) if min(off, default=SAME_CAMERA) < SAME_CAMERA else None
+
     def _camera(self, view: DepthView) -> int | None:
         """The index of a view's camera, which is added if it is new. None if there are MAX_CAMERAS others, or
         if the view states no error of its pose, was made from a cloud, or lacks the configuration."""
@@ -335,7 +341,7 @@ class PoseRefinement:
         if not any(view.pose_deviation) or view.cloud is not None or q is None:
             return None
         T = view.T_base_camera
-        mount = mounted(self._robot, self._on_arm, T, q)
+        mount = self.mount(T, q)
         link, nominal = (None, T) if mount is None else self._on_arm[mount]
         for number, camera in enumerate(self._cameras):
             if camera.link == link and np.allclose(nominal, camera.T):
@@ -454,13 +460,6 @@ class PoseRefinement:
                 matched.noise[rows] = np.hypot(matched.noise[rows], opposite.noise)
                 matched.limits[rows] += opposite.limits
             yield _selected(matched, (n * normals[mine][ok]).sum(axis=1) > ALIKE)
-
-
-def mounted(robot: Robot, on_arm: Sequence[tuple[str, Pose]], T: Pose, q: Configuration) -> int | None:
-    """The index of the camera on the arm (link and T_link_camera) that is nearest to T = T_base_camera; None
-    if it differs by SAME_CAMERA or more."""
-    off = [float(np.abs(T - robot.fk(q, link) @ nominal).max()) for link, nominal in on_arm]
-    return int(np.argmin(off)) if min(off, default=SAME_CAMERA) < SAME_CAMERA else None
 
 
 def _selected(match: _Match, ok: Mask) -> _Match:

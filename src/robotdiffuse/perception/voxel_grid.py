@@ -56,6 +56,11 @@ class VoxelGrid:
         """The centers of the voxels with these indices [m]."""
         return (at + 0.5) * self.edge + self.low
 
+    @property
+    def all_centers(self) -> Points:
+        """The centers of all voxels, in the order of a flattened grid [m]."""
+        return self.centers(np.argwhere(np.ones(self.shape)))
+
     def indices(self, points: Points) -> Indices:
         """The indices of the voxels that contain points of the base frame; they may be outside the grid."""
         return np.floor((points - self.low) / self.edge).astype(np.int64)

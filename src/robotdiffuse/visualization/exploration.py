@@ -133,8 +133,7 @@ def shown_voxels(
 
 def in_known_scene(explorer: RecordedExplorer) -> Voxels:
     """The voxels in or near obstacles that are known without views."""
-    centers = MAP.centers(np.indices(MAP.shape).reshape(3, -1).T)
-    return near_scene(explorer.robot, explorer.scene, centers, MAP.edge).reshape(MAP.shape)
+    return near_scene(explorer.robot, explorer.scene, MAP.all_centers, MAP.edge).reshape(MAP.shape)
 
 
 def frustum(explorer: RecordedExplorer, record: RecordedStep) -> list[Points]:

@@ -61,7 +61,7 @@ from robotdiffuse.perception.occupancy_map import (
     lost_regions,
     probability_free,
 )
-from robotdiffuse.perception.pose_refinement import PoseRefinement, mounted
+from robotdiffuse.perception.pose_refinement import PoseRefinement
 from robotdiffuse.perception.seen_points import point_shapes, seen_shapes
 from robotdiffuse.perception.voxel_grid import LAYERS_BELOW, MAP, Probabilities, Voxels, surface
 from robotdiffuse.planning import load_planner
@@ -249,8 +249,8 @@ class Explorer:
         self._planner = load_planner("robotdiffuse")
         self._seed = converted("seed", Natural, seed)
         self._rng = np.random.default_rng(seed)
-        self._on_arm = [(camera.link, camera.T_link_camera) for camera in cameras]
-        self._poses = PoseRefinement(robot, scene, self._on_arm)
+        on_arm = [(camera.link, camera.T_link_camera) for camera in cameras]
+        self._poses = PoseRefinement(robot, scene, on_arm)
         self._views = ViewMemory(robot)
         self._goal_seen = GoalSeen(robot, self.map, self._views, settings.see_goal)
         self._goal: Goal | None = None
@@ -545,7 +545,7 @@ class Explorer:
         """The index of the arm's camera that took a view; None for a camera that is not on the arm."""
         q = view.configuration
         assert q is not None  # the map takes no other views
-        return mounted(self.robot, self._on_arm, view.T_base_camera, q)
+        return self._poses.mount(view.T_base_camera, q)
 
     def _way_in_to(self, q: Configuration) -> Configurations | None:
         """Waypoints of the latest motion that was returned, if it ended at this configuration."""

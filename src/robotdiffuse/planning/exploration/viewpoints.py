@@ -549,8 +549,7 @@ def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None
     filled = refined(volume.occupied).astype(np.float32)
     if predicted is not None:
         np.maximum(filled, predicted, out=filled)
-    centers = FINE.centers(np.argwhere(np.ones(FINE.shape)))
-    known = near_scene(problem.robot, problem.known_scene, centers, FINE.edge / 2)
+    known = near_scene(problem.robot, problem.known_scene, FINE.all_centers, FINE.edge / 2)
     filled[known.reshape(FINE.shape)] = 1.0
     image = problem.views[0]
     q = np.tile(problem.start, (len(candidates), 1))
