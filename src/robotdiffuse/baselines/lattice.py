@@ -259,8 +259,10 @@ class LatticeSearch:
         counts = (below + above + 1).astype(np.int64)
         nodes = counts.prod(dtype=float)
         if nodes >= MAX_NODES:
-            least = 1.1 * spacing * (nodes / MAX_NODES) ** (1 / robot.dof)
-            raise InputError(f"{name}.spacing is {spacing:g}; use at least {least:.2g} for {robot.name}")
+            min_spacing = 1.1 * spacing * (nodes / MAX_NODES) ** (1 / robot.dof)
+            raise InputError(
+                f"{name}.spacing is {spacing:g}; use at least {min_spacing:.2g} for {robot.name}"
+            )
         sizes = range(1, min(settings.joints_per_move, robot.dof) + 1)
         edges = sum(comb(robot.dof, size) * 2**size for size in sizes)
         if edges > MAX_MOVES:

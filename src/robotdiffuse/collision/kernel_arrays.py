@@ -143,8 +143,8 @@ def compile_robot(robot: Robot) -> RobotArrays:
     )
     if not pairs:
         return arrays
-    known = _known_tables(robot, pairs, groups)
-    pair_indices, tables = build_pair_tables(arrays, robot, radii_of(robot, groups), known)
+    known_tables = _known_tables(robot, pairs, groups)
+    pair_indices, tables = build_pair_tables(arrays, robot, radii_of(robot, groups), known_tables)
     return arrays._replace(pairs=pair_indices, pair_tables=tables)
 
 

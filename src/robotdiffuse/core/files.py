@@ -281,12 +281,12 @@ class _Composer:
             loader.get_event()
             value = self._node(0)
             loader.get_event()
-            further = None
+            second_document = None
             if loader.check_event(yaml.DocumentStartEvent):  # `ros2 topic echo` ends messages with ---
                 loader.get_event()
-                further = self._node(0)
+                second_document = self._node(0)
                 loader.get_event()
-            if further is not None or not loader.check_event(yaml.StreamEndEvent):
+            if second_document is not None or not loader.check_event(yaml.StreamEndEvent):
                 raise InputError(f"{self.where} is not valid YAML: it holds more than one document")
         return value
 

@@ -300,14 +300,14 @@ class Trajectory(Value):
         them to arrays of floats or raises InputError. All other names and numbers are left to the
         validator."""
         names = self.joint_names
-        given = {name: getattr(self, name) for name in ("positions", "times", *RATES)}
+        arrays = {name: getattr(self, name) for name in ("positions", "times", *RATES)}
         q, t, v, a = (
             value.shape if isinstance(value, ndarray) and value.dtype.kind == "f" else ()
-            for value in given.values()
+            for value in arrays.values()
         )
         if not (isinstance(names, tuple) and q == v == a == (*t, len(names)) and all(q)):
-            names, given = check_motion_arrays(names, given)
-            self.__dict__.update(given, joint_names=names)
+            names, arrays = check_motion_arrays(names, arrays)
+            self.__dict__.update(arrays, joint_names=names)
         super().__post_init__()
 
     def __repr__(self) -> str:

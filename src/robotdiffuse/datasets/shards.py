@@ -508,8 +508,8 @@ def scenes_of(manifest: Manifest, shard: Shard, rows: slice = slice(None)) -> Pa
     names = list(manifest.families)
     if len(family) and not 0 <= family.min() <= family.max() < len(names):
         wrong = family[(family < 0) | (family >= len(names))][0]
-        known = f"the manifest has {len(names)}: {', '.join(names)}"
-        raise InputError(f"shard {shard.index}: family is {wrong}; {known}")
+        known_families = f"the manifest has {len(names)}: {', '.join(names)}"
+        raise InputError(f"shard {shard.index}: family is {wrong}; {known_families}")
     floors = np.array([floor_row(manifest.floor(i)) for i in range(len(names))]).reshape(-1, 6)
     return PackedScenes(shard["obstacle_kinds"][rows], shard["obstacle_params"][rows], floors[family])
 

@@ -159,10 +159,10 @@ def normalized(rows: Sequence[Indicators]) -> Float[ndarray, "n 4"]:
     if not len(rows):
         return values
     gains = np.where(HIGHER_IS_BETTER, values, -values)
-    worst = np.fmin.reduce(gains, axis=0)
-    span = np.fmax.reduce(gains, axis=0) - worst
+    minima = np.fmin.reduce(gains, axis=0)
+    span = np.fmax.reduce(gains, axis=0) - minima
     with np.errstate(invalid="ignore"):
-        share = np.where(span > 0, (gains - worst) / np.where(span > 0, span, 1.0), 1.0)
+        share = np.where(span > 0, (gains - minima) / np.where(span > 0, span, 1.0), 1.0)
     return np.where(np.isnan(values), 0.0, share)
 
 

@@ -288,9 +288,9 @@ def _defects(task: _Task, shard: Shard, row: int) -> Defects:
     recorded = {"clearance": shard["clearance"][row, None], "end_clearance": shard["end_clearance"][row]}
     measured = {"clearance": clearances.min(keepdims=True), "end_clearance": clearances[[0, -1]]}
     for name, values in recorded.items():
-        worst = int(np.abs(values - measured[name]).argmax())
-        stated = float(values[worst])
-        value = float(measured[name][worst])
+        max_error_row = int(np.abs(values - measured[name]).argmax())
+        stated = float(values[max_error_row])
+        value = float(measured[name][max_error_row])
         if abs(stated - value) > CLEARANCE_TOLERANCE:
             yield "clearance", f"{name} is {1e3 * stated:.2f} mm; measured: {1e3 * value:.2f} mm"
 

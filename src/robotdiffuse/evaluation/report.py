@@ -124,7 +124,9 @@ def processor() -> str:
 
 def versions(packages: Iterable[str]) -> dict[str, str]:
     """Versions of packages; `none` for one that is not installed."""
-    return {name: next((found.version for found in distributions(name=name)), "none") for name in packages}
+    return {
+        name: next((package.version for package in distributions(name=name)), "none") for name in packages
+    }
 
 
 # Plots

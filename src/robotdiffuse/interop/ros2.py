@@ -552,10 +552,10 @@ class Recording(NamedTuple):
 
         allowed: largest size of all the messages together [bytes]; raises InputError beyond it.
         """
-        left = allowed
+        bytes_left = allowed
         for topic, at, content, read in self.records(topics) if topics else ():
-            left -= len(content)
-            if left < 0:
+            bytes_left -= len(content)
+            if bytes_left < 0:
                 raise InputError(f"the messages of {', '.join(topics)} take more than {allowed:,} bytes")
             yield topic, at, read(content)
 

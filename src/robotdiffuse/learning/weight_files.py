@@ -80,13 +80,13 @@ class RobotIdentity(Settings):
 
     def difference(self, robot: Robot) -> str:
         """How the robot differs from this one; "" if it is the same."""
-        other = RobotIdentity.of(robot)
-        if other.joint_names != self.joint_names:
-            return f"joints {joined(other.joint_names)}"
-        if not np.allclose(other.frame_offsets, self.frame_offsets, atol=DIMENSION_TOLERANCE):
+        identity = RobotIdentity.of(robot)
+        if identity.joint_names != self.joint_names:
+            return f"joints {joined(identity.joint_names)}"
+        if not np.allclose(identity.frame_offsets, self.frame_offsets, atol=DIMENSION_TOLERANCE):
             return "other dimensions"
-        if other.links != self.links:
-            return f"spheres on the links {joined(other.links)}, not {joined(self.links)}"
+        if identity.links != self.links:
+            return f"spheres on the links {joined(identity.links)}, not {joined(self.links)}"
         return ""
 
     def check(self, robot: Robot, where: str) -> None:

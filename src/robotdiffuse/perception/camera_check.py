@@ -67,19 +67,19 @@ def _images(view: DepthView, robot: Robot, q: Configuration) -> tuple[Cells, Cel
     step = min(max(1, round(STEP_ANGLE * view.intrinsics[0])), *view.depth.shape)
     cells = view.depth[step // 2 :: step, step // 2 :: step]
     fx, fy, cx, cy = view.intrinsics
-    coarse = (fx / step, fy / step, (cx - step // 2) / step, (cy - step // 2) / step)
-    return cells, ray_cast(NOTHING, view.T_base_camera, coarse, cells.shape[::-1], robot, q).depth
+    cell_intrinsics = (fx / step, fy / step, (cx - step // 2) / step, (cy - step // 2) / step)
+    return cells, ray_cast(NOTHING, view.T_base_camera, cell_intrinsics, cells.shape[::-1], robot, q).depth
 
 
 def _compared(cells: Cells, arm: Cells) -> tuple[float, float, int]:
     """For the cells in which the model shows the arm and the image has a depth: the fraction whose depth is
     the arm's, the fraction that sees through the arm (larger depths), and the number of these cells."""
     compared = np.isfinite(arm) & (cells > 0)
-    behind = cells[compared] - arm[compared] - SPHERES_AHEAD
-    if not len(behind):
+    excess = cells[compared] - arm[compared] - SPHERES_AHEAD
+    if not len(excess):
         return 0.0, 0.0, 0
-    same = np.abs(behind) < SAME_DEPTH
-    return float(same.mean()), float((behind >= SAME_DEPTH).mean()), len(behind)
+    agree = np.abs(excess) < SAME_DEPTH
+    return float(agree.mean()), float((excess >= SAME_DEPTH).mean()), len(excess)
 
 
 def implausible(view: DepthView) -> str:

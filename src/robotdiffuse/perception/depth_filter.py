@@ -77,14 +77,14 @@ def smoothed(depth: DepthImage, spread: float) -> tuple[DepthImage, float]:
     from scipy.ndimage import correlate1d, uniform_filter, uniform_filter1d
 
     seen, inverse = _inverse_depths(depth)
-    whole = uniform_filter(seen.astype(np.float32), SQUARE, mode="constant") > 1 - 0.5 / SQUARE**2
+    is_complete = uniform_filter(seen.astype(np.float32), SQUARE, mode="constant") > 1 - 0.5 / SQUARE**2
     mean = uniform_filter(inverse, SQUARE)
     variance = uniform_filter(inverse**2, SQUARE) - mean**2
     ramp = np.arange(SQUARE) - SQUARE // 2
     for axis in (0, 1):
         slope = uniform_filter1d(correlate1d(inverse, ramp / (ramp**2).sum(), axis), SQUARE, 1 - axis)
         variance -= slope**2 * (ramp**2).mean()
-    flat = whole & (variance < FLATNESS * spread**2)
+    flat = is_complete & (variance < FLATNESS * spread**2)
     smooth = np.divide(1.0, mean, out=depth.astype(np.float64), where=flat).astype(np.float32)
     return smooth, float(flat.sum() / max(seen.sum(), 1))
 
@@ -155,8 +155,8 @@ def filtered(view: DepthView) -> FilteredDepth:
         squared_length = noise.correlation**2 + MEDIAN_LENGTH**2
     smooth, flat_share = smoothed(depth, spread)
     # the part of the variance that smoothing leaves: errors are alike in an area of 2 pi length^2
-    left = min(1.0, 2 * np.pi * squared_length / SQUARE**2)
-    return FilteredDepth(smooth, spread * float(np.sqrt(1 - flat_share * (1 - left))), spread)
+    noise_left = min(1.0, 2 * np.pi * squared_length / SQUARE**2)
+    return FilteredDepth(smooth, spread * float(np.sqrt(1 - flat_share * (1 - noise_left))), spread)
 
 
 def patch_noise(depth: DepthImage) -> tuple[float, float]:

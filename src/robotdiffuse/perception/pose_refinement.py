@@ -392,9 +392,9 @@ class PoseRefinement:
             unknowns = unknowns - np.linalg.solve(hessian, gradient)
         covariance = np.linalg.inv(hessian)
         for i, camera in enumerate(self._cameras):
-            own = slice(6 * i, 6 * i + 6)
-            camera.error = unknowns[own]
-            camera.covariance = covariance[own, own]
+            columns = slice(6 * i, 6 * i + 6)
+            camera.error = unknowns[columns]
+            camera.covariance = covariance[columns, columns]
 
     def _matches(self, unknowns: Values, gate: float) -> Iterator[_Match]:
         """Matches the points of each image with the arm, the known shapes, and the points of other images."""
@@ -417,8 +417,8 @@ class PoseRefinement:
             image = self._images[i]
             rows = np.zeros((len(use), len(unknowns)))
             m = n @ poses[i][:3, :3]  # normals in the camera's frame
-            own = slice(6 * image.camera, 6 * image.camera + 6)
-            rows[:, own] = np.hstack([m, np.cross(image.points[use], m)])
+            columns = slice(6 * image.camera, 6 * image.camera + 6)
+            rows[:, columns] = np.hstack([m, np.cross(image.points[use], m)])
             noise = np.hypot(image.noise[use], error)
             return _Match(rows, r, noise, gate * image.shift[use] + NOISES * noise)
 

@@ -81,14 +81,14 @@ def pose_configurations(
     stale_rounds = 0
     for k in range(rounds):
         check_time("configurations of the goal pose")
-        most = count if k == 0 else SEEDS
+        count_per_pose = count if k == 0 else SEEDS
         # Projection ends at the boundary of the tolerances; to find configurations inside, every other round
         # uses only a fraction of the tolerances.
         aims = poses
         if k % 2:
             fraction = rng.uniform()
             aims = [_tightened(pose, fraction) for pose in poses]
-        new = [at_pose(problem, aim, most, rng, exact) for aim in aims]
+        new = [at_pose(problem, aim, count_per_pose, rng, exact) for aim in aims]
         solutions = [np.concatenate([earlier, more]) for earlier, more in zip(solutions, new, strict=True)]
         combined = new[0] if len(poses) == 1 else _combined(problem, poses, solutions, rng)
         if len(poses) > 1 or problem.constraints:

@@ -188,8 +188,10 @@ def falling_clearances(most: float, checker: CollisionChecker, states: Configura
     In addition, if below `most`: the clearance of the start, states[0], and the clearance of the goal that is
     farthest from obstacles, each minus END_MARGIN.
     """
-    own = checker.link_clearances(states).min(axis=1, initial=1.0)
-    at_ends = {max(float(end) - END_MARGIN, 0.0) for end in (own[0], own[1:].max()) if end < most}
+    clearances = checker.link_clearances(states).min(axis=1, initial=1.0)
+    at_ends = {
+        max(float(end) - END_MARGIN, 0.0) for end in (clearances[0], clearances[1:].max()) if end < most
+    }
     return sorted(
         {most * step / CLEARANCE_STEPS for step in range(CLEARANCE_STEPS + 1)} | at_ends, reverse=True
     )

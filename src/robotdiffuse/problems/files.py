@@ -305,9 +305,11 @@ def _requested(
 
     for i, values in enumerate(request.joint_goals):
         for name, value in values.items():
-            held = robot.locked.get(name, value)
-            if abs(held - value) > MIMIC_SLACK:
-                notes.append(f"goal_constraints[{i}]: {name} is {value:g}, but it is held at {held:g}")
+            locked_value = robot.locked.get(name, value)
+            if abs(locked_value - value) > MIMIC_SLACK:
+                notes.append(
+                    f"goal_constraints[{i}]: {name} is {value:g}, but it is held at {locked_value:g}"
+                )
     start = robot.planned_values("start_state", request.start)
     for attached in request.attached:
         robot = attached.held_by(robot, start)

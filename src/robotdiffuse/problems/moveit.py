@@ -668,8 +668,8 @@ def _pose_goal(where: str, goal: JsonObject, frames: MoveItFrames, notes: list[s
     positions, orientations = (
         mappings_of(f"{where}.", goal, f"{kind}_constraints") for kind in ("position", "orientation")
     )
-    others = any(goal.get(f"{kind}_constraints") for kind in ("joint", "visibility"))
-    if len(positions) != 1 or len(orientations) != 1 or others:
+    has_others = any(goal.get(f"{kind}_constraints") for kind in ("joint", "visibility"))
+    if len(positions) != 1 or len(orientations) != 1 or has_others:
         raise InputError(f"{where} must have one position and one orientation constraint, and no others")
     [(at, position)], [(_, orientation)] = positions, orientations
     link = position.get("link_name")

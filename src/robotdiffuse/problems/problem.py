@@ -116,13 +116,13 @@ class PoseGoal(Value):
         if not isinstance(self.frame, str):
             raise InputError(f"goal.frame is {shown(self.frame)}; it must be the name of a link")
         object.__setattr__(self, "T_base_frame", rigid_transform("goal.T_base_frame", self.T_base_frame))
-        for name, most, unit in (("xyz_tolerance", MAX_COORDINATE, "m"), ("rpy_tolerance", MAX_TURN, "rad")):
+        for name, limit, unit in (("xyz_tolerance", MAX_COORDINATE, "m"), ("rpy_tolerance", MAX_TURN, "rad")):
             value = getattr(self, name)
             if value is not None:
                 array = numbers(value)
-                if array is None or array.shape != (3,) or not ((array >= 0) & (array <= most)).all():
+                if array is None or array.shape != (3,) or not ((array >= 0) & (array <= limit)).all():
                     raise InputError(
-                        f"goal.{name} is {shown(value)}; it must be 3 numbers from 0 to {most:g} [{unit}]"
+                        f"goal.{name} is {shown(value)}; it must be 3 numbers from 0 to {limit:g} [{unit}]"
                     )
                 object.__setattr__(self, name, array)
         super().__post_init__()

@@ -684,8 +684,10 @@ async def _serve(
             server.should_exit = True
         else:
             remaining = settings.workers - 1
-            others = f"; {remaining} more {'is' if remaining == 1 else 'are'} starting" if remaining else ""
-            say(f"ready, with 1 worker{others}")
+            starting_note = (
+                f"; {remaining} more {'is' if remaining == 1 else 'are'} starting" if remaining else ""
+            )
+            say(f"ready, with 1 worker{starting_note}")
 
     say(f"listening on {_address(listener)}; loading code (about a minute if it must be compiled)")
     starting = asyncio.ensure_future(pool.start())

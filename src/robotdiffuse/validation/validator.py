@@ -299,15 +299,15 @@ class Verifier:
             at_rest = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
         if wrong_rates:
             return self._report(trajectory.positions, trajectory.times, wrong_rates, at_rest)
-        found = [self._limits_between(cubics)]
+        violations = [self._limits_between(cubics)]
         if self.dynamics is not None:
             pieces = trajectory_pieces(trajectory)
-            found.append(self._torques(trajectory.times, pieces, ", with the payload"))
+            violations.append(self._torques(trajectory.times, pieces, ", with the payload"))
         along = None
         if self.constraints is not None:
-            found.append(self._too_fast(cubics))
-            along = None if any(found) else cubics.sampled(self.settings.constraint_chord)[:2]
-        report = self._report_on_chords(cubics, found, at_rest, along)
+            violations.append(self._too_fast(cubics))
+            along = None if any(violations) else cubics.sampled(self.settings.constraint_chord)[:2]
+        report = self._report_on_chords(cubics, violations, at_rest, along)
         if not report.valid:
             return report
         jerks = np.maximum(trajectory.peak_jerks, cubics.extremes.jerk)

@@ -300,10 +300,10 @@ def _score(
     score = 0.0
     for nearness, weight in ((arm_nearness, 1.0), (ghost_nearness, 0.5)):
         score += weight * float((nearness > obstacle_nearness).sum() / max(1, (nearness > 0).sum()))
-    drawn = obstacle_nearness > 0
-    if drawn.any():
+    obstacle_pixels = obstacle_nearness > 0
+    if obstacle_pixels.any():
         count = owners[-1] + 1
-        pixels_drawn = np.bincount(owners[faces[drawn]], minlength=count)
+        pixels_drawn = np.bincount(owners[faces[obstacle_pixels]], minlength=count)
         pixels_shown = np.bincount(owners[faces[obstacle_nearness > arm_nearness]], minlength=count)
         score += 0.5 * float((pixels_shown / np.maximum(1, pixels_drawn)).mean())
     pixels = camera.project(trace)
@@ -536,9 +536,9 @@ def _paint(camera: Camera, solid: Surface, clear: Sequence[ClearSurface]) -> Flo
     visible_triangles = (ident, screen, solid.faces, solid.normals, _linear_array(solid.colors))
     shade(image, near, visible_triangles, view, height - 1e-4, sky, key)
     for surface in clear:
-        nearness, *shown = drawn_by(camera, surface.surface)
+        nearness, *buffers = drawn_by(camera, surface.surface)
         arrays = surface.surface.faces, surface.surface.normals, _linear_array(surface.surface.colors)
-        blend_ghost(image, near, nearness, (*shown, *arrays), view, toward, surface.tint, surface.alpha)
+        blend_ghost(image, near, nearness, (*buffers, *arrays), view, toward, surface.tint, surface.alpha)
     return image
 
 

@@ -194,8 +194,8 @@ def shade(image, near, seen, camera, height, sky, key):
             else:
                 pixel = depth * np.hypot(rays[0, 0], rays[1, 0])
                 footprint = pixel * norm / max(0.1 * norm, -ray[2])
-                fine = 0.4 * _grid(x[0], x[1], 0.25, 0.003, footprint)
-                stripe = max(fine, _grid(x[0], x[1], 1.0, 0.005, footprint))
+                fine_lines = 0.4 * _grid(x[0], x[1], 0.25, 0.003, footprint)
+                stripe = max(fine_lines, _grid(x[0], x[1], 1.0, 0.005, footprint))
             for c in range(3):
                 flat = base_color[c] + stripe * (GROUND_LINES[c] - base_color[c])
                 lit = KEY_COLOR[c] * q + SKY_COLOR[c] * s + BOUNCE_COLOR[c] * (0.5 - 0.5 * n[2])

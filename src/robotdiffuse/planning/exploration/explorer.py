@@ -528,8 +528,8 @@ class Explorer:
         way_in = self._way_in_to(problem.start)
         # the arm cannot go back far along its latest motion: there is none, or it was short
         hemmed_in = way_in is None or bool(moved(self.robot, way_in[:1], [problem.start])[0] < CONFINED)
-        taken = self._goal_seen.taken
-        arguments = wanted, predicted, self._rng, taken, hemmed_in, self._fixed_view
+        goal_views = self._goal_seen.taken
+        arguments = wanted, predicted, self._rng, goal_views, hemmed_in, self._fixed_view
         paths = best_viewpoints(self.map, tree, self.cameras, *arguments)
         for waypoints in islice(paths, len(self.cameras) * self.settings.look_attempts):
             if policy == STRICT:

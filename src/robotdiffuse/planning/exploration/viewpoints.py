@@ -320,7 +320,7 @@ def moved(robot: Robot, to: Configurations, others: Sequence[Configuration]) -> 
     """For each configuration of `to`, how far the arm moves to it from the nearest configuration of `others`:
     the mean over the arm's covering spheres [m]."""
     reached, away = (np.stack([robot.placed_spheres(q)[:, :3] for q in rows]) for rows in (to, others))
-    return np.min([np.linalg.norm(reached - other, axis=2).mean(axis=1) for other in away], axis=0)
+    return np.min([np.linalg.norm(reached - spheres, axis=2).mean(axis=1) for spheres in away], axis=0)
 
 
 def first_parts(waypoints: Configurations) -> Iterator[Configurations]:

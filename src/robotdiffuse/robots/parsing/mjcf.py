@@ -187,8 +187,8 @@ class ConvertedModel:
             kind = kind_of("Joint", model.jnt_type[joint])
             if joint in self.held:
                 slide = f"slide joint {label}, which has no range,"
-                held = slide if kind == "slide" else f"the free joint of {name}"
-                self.notes.append(f"{held} is held where the model places it")
+                held_joint = slide if kind == "slide" else f"the free joint of {name}"
+                self.notes.append(f"{held_joint} is held where the model places it")
                 continue
             if kind == "ball":
                 raise InputError(f"{self.path}: joint {label} is a ball joint; use three hinges in its place")

@@ -373,14 +373,14 @@ def linkage_notes(file: Path, robot: Robot) -> list[str]:
             )
         if leader is joint or leader.name in robot.locked:
             continue
-        what = f"joint {joint.name} mimics {leader.name}, which is planned; that is not supported: "
+        problem = f"joint {joint.name} mimics {leader.name}, which is planned; that is not supported: "
         if any(joint in robot.joints_above(link) for link in (*robot.meshes, *robot.tips)):
             raise InputError(
-                f"{file}: {what}hold {leader.name} with --lock {leader.name}=VALUE, end the arm above it "
+                f"{file}: {problem}hold {leader.name} with --lock {leader.name}=VALUE, end the arm above it "
                 f"with --tip, or remove {joint.name} and what it carries, which is then not checked"
             )
         notes.append(
-            f"{what}{joint.name} is held, so the pose of {joint.child} is wrong and must not be a goal"
+            f"{problem}{joint.name} is held, so the pose of {joint.child} is wrong and must not be a goal"
         )
     return notes
 
