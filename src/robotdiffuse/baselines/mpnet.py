@@ -95,6 +95,7 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
                 settings = replace(settings, resolution=finer_resolution(settings.resolution))
             elif best is None or candidate.broken < best.broken:
                 best = candidate
+        # the validator may accept it nevertheless: covering spheres are larger than the meshes
         result = None if best is None else context.finish(start_goal.complete(best.path), self.name)
         remedy = "a longer time limit" if settings.hybrid else "a longer time limit or hybrid replanning"
         return result or context.unsolved(

@@ -32,8 +32,8 @@ class SavedModule(nn.Module):
     """A network that is saved in files, see `checkpoint`."""
 
     def exports(self) -> dict[str, bytes]:
-        """The contents of the ONNX files that planning runs, by what follows the network's name in the file
-        name; empty for a network that planning runs with PyTorch."""
+        """The contents of the ONNX files that planning runs, with what follows the network's name in the
+        file name as keys; empty for a network that planning runs with PyTorch."""
         return {}
 
 

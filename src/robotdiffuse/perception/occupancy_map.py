@@ -1,5 +1,5 @@
 """Unknown space, which no view saw: assumptions about it, the unknown space that a motion passes through, and
-the motion's probability to be free; OccupancyMap: which voxels of 2 cm around the arm are free, occupied or
+the motion's probability of being free; OccupancyMap: which voxels of 2 cm around the arm are free, occupied or
 unknown, updated view by view; and ViewMemory: keeps the views that showed most new voxels.
 
 An assumption is a set of obstacles in addition to the observed ones. The space that the arm occupies at its
@@ -136,8 +136,8 @@ LOST_WIDTH = 3
 """Smallest width [voxels of 4 cm] of lost regions. The images that the network was trained with had smaller
 ones, so it mistakes large ones for free space."""
 LOST_PROBABILITY = 0.15
-"""Smallest probability that a voxel of a lost region is occupied. Behind obstacles that gave no return it was
-0.18 on average; behind a hand in front of the lens, it was 0.03 to 0.07."""
+"""Lower predicted probabilities of voxels in lost regions are raised to this. Measured: behind obstacles that
+gave no return, 18 % of these voxels were occupied on average; behind a hand in front of the lens, 3 to 7 %."""
 
 
 def lost_regions(volume: ObservedVolume) -> Voxels:
@@ -432,7 +432,7 @@ class OccupancyMap:
 
     @property
     def oldest(self) -> float:
-        """What views from before this time showed is forgotten [s]."""
+        """What was seen before this time is forgotten [s]."""
         return -np.inf if self.max_age is None else self._now - self.max_age
 
     @property
@@ -570,7 +570,7 @@ class ViewMemory:
         np.maximum.at(errors, cell, np.concatenate([memory.errors for memory in self._memories]))
         stray = MAP.hold(free, points)
         if any(filtered(memory.view).spread for memory in self._memories):
-            from scipy.spatial import KDTree  # plans do without it
+            from scipy.spatial import KDTree  # late: plans need no KDTree
 
             once = counts == 1
             distances, _ = KDTree(points).query(points[once], k=2, distance_upper_bound=ALONE_DISTANCE)

@@ -252,7 +252,7 @@ MAX_LOCKED_JOINTS = 1
 """A link, such as the bellows of a lift, belongs to the arm if at most this many locked joints connect it to
 the arm. Links after more locked joints belong to a head or another arm."""
 MAX_DEFAULT_JOINTS = 3
-"""The reason `default` does not apply to pairs of links with more joints between them: limits of single
+"""Pairs of links with more joints between them are not allowed for the reason `default`: limits of single
 joints keep neighbors apart, but not a hand from its own shoulder."""
 MAX_POSE_OVERLAP = 0.03
 """If links overlap in a named pose by less than this [m], the pair is allowed for the reason `pose`."""
@@ -424,9 +424,9 @@ MAX_SPHERE_CASES = 2000
 MAX_PART_CASES = 60
 """Largest number of false collisions of convex parts per pair of links that are examined."""
 NARROWEST_FRACTION = 0.003
-"""`PairFalseCollisions.places` leaves out those false collisions of spheres with the narrowest gaps between
-the convex parts, since spheres need not become finer there. For each pair, they are at most this fraction of
-all configurations."""
+"""`PairFalseCollisions.places` leaves out the false collisions of spheres with the narrowest gaps between the
+convex parts: they are rare, and only much finer spheres would avoid them. For each pair, they are at most
+this fraction of all configurations."""
 
 
 class PairFalseCollisions(NamedTuple):

@@ -104,8 +104,8 @@ def with_prefixes(text: bytes) -> bytes:
 
 
 def compiled_xacro(path: Path, packages: Packages) -> bytes:
-    """The URDF that xacrodoc compiles from a xacro file. This runs the code in its expressions. After an
-    error for an unknown package, the package's folder is added to xacrodoc's look-up, and the file compiled
+    """The URDF that xacro compiles from a xacro file. This runs the code in its expressions. After an error
+    for an unknown package, the package's folder is added to xacrodoc's look-up, and the file is compiled
     again.
 
     Raises InputError if the file cannot be compiled, or if xacrodoc is not installed.

@@ -203,7 +203,8 @@ SUFFIX_CHARACTERS = "_-/0123456789 "
 MAX_FINGER_JOINTS = 2
 """Largest number of independent joints per finger of a gripper with two fingers."""
 MAX_HAND_FINGER_JOINTS = 3
-"""Largest number of independent joints per finger of a gripper with another number of fingers."""
+"""Largest number of independent joints per finger of a gripper with another number of fingers; for an
+exception, see MIN_ARM_JOINTS."""
 MIN_ARM_JOINTS = 4
 """Chains with fewer own joints (see `Arm.own_joints`) count as arms only if no chain has this many. Three or
 more branches after at least this many own joints form a hand, with any number of joints per finger. But if
