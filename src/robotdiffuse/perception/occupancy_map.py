@@ -1,6 +1,6 @@
 """Unknown space, which no view saw: assumptions about it, the unknown space that a motion passes through, and
-the motion's probability of being free; OccupancyMap: which voxels of 2 cm around the arm are free, occupied or
-unknown, updated view by view; and ViewMemory: keeps the views that showed most new voxels.
+the motion's probability of being free; OccupancyMap: which voxels of 2 cm around the arm are free, occupied
+or unknown, updated view by view; and ViewMemory: keeps the views that showed most new voxels.
 
 An assumption is a set of obstacles in addition to the observed ones. The space that the arm occupies at its
 start and goals is removed from them (carved out).
@@ -136,8 +136,9 @@ LOST_WIDTH = 3
 """Smallest width [voxels of 4 cm] of lost regions. The images that the network was trained with had smaller
 ones, so it mistakes large ones for free space."""
 LOST_PROBABILITY = 0.15
-"""Lower predicted probabilities of voxels in lost regions are raised to this. Measured: behind obstacles that
-gave no return, 18 % of these voxels were occupied on average; behind a hand in front of the lens, 3 to 7 %."""
+"""Lower predicted probabilities of voxels in lost regions are raised to this. Measured: behind obstacles
+that gave no return, 18 % of these voxels were occupied on average; behind a hand in front of the lens, 3 to
+7 %."""
 
 
 def lost_regions(volume: ObservedVolume) -> Voxels:
