@@ -50,6 +50,7 @@ BAD_CALL = {
     "a family without its share": (["data", "generate", "--out", "d", "--mix", "rop"], "'rop' is not NAME=NUMBER"),
     "shares without a sum": (["data", "generate", "--out", "d", "--mix", "rop=1e308,shelf=1e308"], "at most 1e9"),
     "a seed that is too large": (["train", "encoder", "--out", "e", "--seed", "9" * 20], "below 2^63"),
+    "a seed of more than 308 digits": (["train", "encoder", "--out", "e", "--seed", "9" * 400], "below 2^63"),
     "more motions than a disk holds": (["data", "generate", "--out", "d", "--trajectories", "9" * 20], "at most 10^9"),
     "train without out": (["train", "encoder"], "--out"),
     "train twice as long": (["train", "encoder", "--out", "e", "--minutes", "1", "--samples", "9"], "not allowed with"),

@@ -100,7 +100,7 @@ class Planner:
         package_keyword_replacement: The folder that replaces `package://` in the URDF.
         user_link_names: Links that `link_id` counts from 0.
         user_joint_names: Joints in the order of `qpos`; the planned ones must have the order of the chain.
-            None: all that move, in the order of the URDF. A `qpos` may also hold the planned ones alone.
+            Empty: all that move, in the order of the URDF. A `qpos` may also hold the planned ones alone.
         joint_vel_limits: Velocity limits of the planned joints [rad/s]; none: 1, as in MPlib.
         joint_acc_limits: Acceleration limits of the planned joints [rad/s²]; none: those of the robot (MPlib:
             1).

@@ -68,7 +68,7 @@ def number(kind: type, fits: Callable[[Any], bool], what: str) -> Callable[[str]
             value = kind(text) if kind is float or is_digits else math.nan
         except ValueError:
             value = math.nan
-        if not (math.isfinite(value) and fits(value)):
+        if not (fits(value) and math.isfinite(value)):
             raise ArgumentTypeError(f"{text!r} is not {what}")
         return value
 

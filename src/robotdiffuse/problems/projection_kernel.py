@@ -105,8 +105,8 @@ def _residuals(rows, limits, q, work):
                     for i in range(3):
                         entry += ANGLE_WEIGHT * work.axes[k, i] * work.error[i] / sine
                 else:
-                    # the axis of the CONE is opposite to its direction: a turn about any axis across the
-                    # direction reduces the angle, hence also about (1, 1, 1)
+                    # the axis of the CONE is opposite to its direction: a turn about any
+                    # other axis reduces the angle; (1, 1, 1) is taken
                     entry = ANGLE_WEIGHT * np.sum(work.axes[k])
                 work.J[count, rows.chain[m, k]] = entry
             count += 1
@@ -126,7 +126,7 @@ def step(rows, limits, q, most, work):
         return 0
     work.held[:] = False
     damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
-    # if the step would move joints that are at a limit beyond it, solve again without these joints
+    # if joints at a limit would move beyond it, solve again without these joints
     clamped_joint = False
     for k in range(dof):
         at_low = q[k] <= rows.lower[k]

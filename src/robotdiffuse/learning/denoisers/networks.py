@@ -83,8 +83,8 @@ def attend(
 ) -> Float[Tensor, "batch tokens width"]:
     """Attention of tokens to others; causal: each token attends only to itself and the tokens before it.
 
-    On a CPU, bf16 and short sequences use plain matrix products, long sequences in fp32 and GPUs the
-    fused kernel; MAX_UNFUSED_TOKENS has the times of both on a CPU.
+    On a CPU, bf16 and short sequences use plain matrix products, and long sequences in fp32 the fused
+    kernel. GPUs always use the fused kernel. MAX_UNFUSED_TOKENS has the times of both on a CPU.
     """
     batch, heads, tokens, size = q.shape
     plain = q.dtype == torch.bfloat16 or k.shape[2] <= MAX_UNFUSED_TOKENS

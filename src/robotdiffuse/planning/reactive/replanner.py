@@ -175,7 +175,7 @@ class TimedPath:
         count = max(int(self.line.length / LINE_INTERVAL), 8)
         grid = timing_grid(self.line, TimingSettings(line_intervals=count, corner_intervals=CORNER_INTERVALS))
         # s̈ is constant in an interval, and ṡ is 0 at the path's end, so an arm at rest in the last interval
-        # could not start. This interval is divided until its last part is within END_TOLERANCE of it;
+        # could not start. This interval is divided until its last part is within END_TOLERANCE of the end;
         # shorter parts would coincide in rounding.
         parts = (grid[-1] - grid[-2]) * 0.5 ** np.arange(1, 26)
         grid = np.concatenate([grid[:-1], grid[-1] - parts[parts > 0.4 * END_TOLERANCE], grid[-1:]])
