@@ -30,7 +30,7 @@ SHARDS_PER_BLOCK = 16
 """Number of shards whose rows are shuffled together. 16 shards of 500 rows are 57 MB of
 memory-mapped files."""
 Seed = Annotated[int, Bound(least=-(2.0**63), below=2.0**63)]
-"""The seeds that PyTorch takes."""
+"""Integers of 64 bits, which PyTorch takes as seeds."""
 MAX_THREADS = 8
 """Largest number of threads that prefetch batches."""
 
@@ -89,8 +89,9 @@ class RopDataset(Dataset[dict[str, Tensor]]):
                 each path; None: the stored waypoints.
 
         Raises:
-            InputError: For an unknown split, fewer than 1 point or 2 waypoints, a folder without data or with
-                damaged shards, and data of another robot.
+            InputError: For an unknown split, fewer than 1 point or 2 waypoints, a seed out of bounds, a
+                device that PyTorch cannot use, a folder without data or with damaged shards, and data of
+                another robot.
         """
         check_name("split", split, SPLITS)
         points = converted("points", Count, points)

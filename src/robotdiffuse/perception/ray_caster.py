@@ -46,8 +46,8 @@ def rectangle(x, y, z, r, intrinsics, h, w):
         return 0, -1, 0, -1
     near = max(z - r, _NEAR)
     far = z + r
-    # each edge is projected at the depth that makes the rectangle larger: at the near depth if it is on its
-    # own side of the image's center, else at the far depth
+    # each edge is projected at the depth that makes the rectangle larger: the near depth if, for example, the
+    # left edge is left of the optical axis, else the far depth
     left = (x - r) / (near if x < r else far)
     right = (x + r) / (near if x > -r else far)
     top = (y - r) / (near if y < r else far)

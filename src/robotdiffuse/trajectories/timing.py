@@ -325,8 +325,8 @@ class StopGraph:
 
     def sample(self, radii: JointValues, travel: float) -> tuple[Values, Configurations]:
         """Values of s, including all stops, and the configurations there [n, dof]. Between neighboring stops,
-        the values are equally spaced. Averaged over these steps, no point of the arm moves by more than
-        `travel` [m] in a step. radii: largest `motion_radii` of each joint over all links."""
+        the values are equally spaced, so closely that no point of the arm moves by more than `travel` [m] a
+        step on average. radii: largest `motion_radii` of each joint over all links."""
         parts = []
         for low, high in zip(self.stops[:-1], self.stops[1:], strict=True):
             samples = self.line(np.linspace(low, high, 33), 0)
