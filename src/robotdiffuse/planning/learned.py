@@ -37,7 +37,7 @@ class LearnedPlanner(Planner[LearnedPlannerSettings]):
     """A planner that needs the weights of a network."""
 
     network_name: ClassVar[str]
-    """Name of the network in `learning.NETWORKS`."""
+    """Name of the network in `weight_files.NETWORKS`."""
 
     def __init__(self, settings: LearnedPlannerSettings | None = None) -> None:
         """Raises InputError if the folder in the setting `weights` holds no weights."""

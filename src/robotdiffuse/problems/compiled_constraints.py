@@ -73,8 +73,7 @@ class ConstraintViolation:
     at: float
     """Place on the motion: waypoint index plus fraction of the segment after it; 0 for a configuration."""
     value: float
-    """Maximum of the constrained distance or angle from this place until the constraint is satisfied again
-    [m] or [rad]."""
+    """Largest constrained distance or angle until the constraint is satisfied again [m] or [rad]."""
     limit: float
     """Largest allowed distance or angle [m] or [rad]."""
     angular: bool

@@ -128,7 +128,7 @@ class Stop:
     reason: str
     """The violation that the motion would have: what is in the way."""
     certified: bool
-    """Whether the validator accepts the stop among all that was seen; if not, the arm cannot stop in time."""
+    """Whether the validator accepts the stop among what was seen since `next`; if not, it comes too late."""
 
 
 def braked(robot: Robot, motion: Trajectory, time: float) -> Trajectory:
@@ -224,8 +224,8 @@ class Explorer:
             cameras: The cameras on the arm, for which motions to viewpoints are planned. Views of other
                 cameras can be observed as well.
             scene: Shapes that are known without views, such as the floor, in the frame of the base.
-            free_zone: Low and high corner [2, 3] of a box in the frame of the base [m] that counts as free
-                unless a view finds something there, such as the space around the arm's base; None: no box.
+            free_zone: Low and high corner [2, 3] of a box in the frame of the base [m], such as the space
+                around the arm's base. It counts as free unless a view finds something there; None: no box.
             settings: The policy for unseen space, and limits of time and views.
             seed: Seed of all random numbers, at least 0.
 

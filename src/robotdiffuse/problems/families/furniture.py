@@ -237,9 +237,9 @@ class FurnitureFrame:
 
         boards: z of the boards' tops. sides: y of the uprights' right sides.
         """
-        left = sides[0] + t
-        right = sides[-1]
-        self.boxes((((0.0, left, z - t), (depth, right, z)) for z in boards), "board")
+        right = sides[0] + t
+        left = sides[-1]
+        self.boxes((((0.0, right, z - t), (depth, left, z)) for z in boards), "board")
         self.boxes((((0.0, y, low), (depth, y + t, height)) for y in sides), "upright")
 
 
@@ -765,22 +765,22 @@ class Cabinet(Furniture):
         low = 0.0 if on_ground else rng.uniform(*self.lowest)
         tops = low + t + edges(rng.uniform(*self.row_height, count(self.rows, rng)), t)
         sides = centered(rng.uniform(*self.column_width, count(self.columns, rng)), t)
-        left = sides[0]
-        right = sides[-1] + t
+        right = sides[0]
+        left = sides[-1] + t
         height = tops[-1]
         boards = tops if rng.random() < self.top_share else tops[:-1]
         frame.case(depth, t, low, height, boards, sides)
         if rng.random() < self.back_share:
-            frame.box((depth, left, low), (depth + t, right, height), "back")
+            frame.box((depth, right, low), (depth + t, left, height), "back")
         regions: list[tuple[Corner, Corner, Vector]] = []
         if not on_ground and rng.random() < self.legs_share:
             w = 2 * t
             for x in (0.0, depth - w):
-                for y in (left, right - w):
+                for y in (right, left - w):
                     frame.box((x, y, 0.0), (x + w, y + w, low), "leg")
-        regions.append(((0.0, left + 2 * t, 0.0), (depth / 2, right - 2 * t, low), AHEAD))
+        regions.append(((0.0, right + 2 * t, 0.0), (depth / 2, left - 2 * t, low), AHEAD))
         if len(boards) == len(tops):
-            regions.append(((0.0, left, height), (depth, right, height + TOP_HEIGHT), AHEAD))
+            regions.append(((0.0, right, height), (depth, left, height + TOP_HEIGHT), AHEAD))
         cells = [
             (y + t, end, z, ceiling)
             for z, ceiling in zip(tops[:-1], tops[1:] - t, strict=True)
