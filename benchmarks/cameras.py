@@ -72,7 +72,7 @@ from robotdiffuse.problems.files import SEED, held_out_problem, line_length, loa
 from robotdiffuse.problems.problem import PREDICTED, Problem
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
-from robotdiffuse.validation.validator import verify, verify_trajectory
+from robotdiffuse.validation.validator import verify
 
 LIMIT = 1.0
 """CPU time of every method on every problem [s]."""
@@ -244,7 +244,7 @@ def is_free(problem: Problem, result: PlanResult) -> bool:
     """Whether the motion is valid in the true scene."""
     if result.path is None or result.trajectory is None:
         return False
-    return verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
+    return verify(problem, result.path).valid and verify(problem, result.trajectory).valid
 
 
 SETTING_NAMES = ("views", "images", "walls", "cameras")

@@ -35,7 +35,7 @@ from robotdiffuse.core.types import PlanResult, Status
 from robotdiffuse.problems.files import held_out_problem, problem_record
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.validation.report import Report
-from robotdiffuse.validation.validator import VerifySettings, verify, verify_trajectory
+from robotdiffuse.validation.validator import VerifySettings, verify
 
 PLANNERS = {
     "RRTConnect": og.RRTConnect,
@@ -152,11 +152,7 @@ class Cost(NamedTuple):
 
 
 def cost(problem: Problem, motion: rd.Path | rd.Trajectory, folder: Path) -> Cost:
-    timed = isinstance(motion, rd.Trajectory)
-
     def validator() -> Report:
-        if timed:
-            return verify_trajectory(problem, motion, LENIENT)  # type: ignore[arg-type]
         return verify(problem, motion, LENIENT)  # type: ignore[arg-type]
 
     certificate = certify(problem, motion, LENIENT)

@@ -32,7 +32,7 @@ from robotdiffuse.generation.factory import solve
 from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.packed_scenes import PackedScenes
 
 STAGES = {
     "drawing scene, start and goals (inverse kinematics)": ("factory.py", "draw"),

@@ -58,11 +58,11 @@ from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.evaluation.bench_comparisons import wilson_interval
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.occupancy_map import Corners
-from robotdiffuse.perception.ray_caster import voxels_within
+from robotdiffuse.perception.ray_caster import ray_cast, voxels_within
 from robotdiffuse.perception.voxel_grid import FINE, FINE_VOXEL_SIZE, LOW
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.exploration.explorer import Explorer
-from robotdiffuse.planning.exploration.simulated import explore, measured, taken, wrist_camera
+from robotdiffuse.planning.exploration.simulated import Event, explore, measured, taken, wrist_camera
 from robotdiffuse.planning.exploration.steps import (
     DONE,
     LOOK,
@@ -193,9 +193,14 @@ def play(problem: Problem, family: str, number: int, method: str, images: Images
             collided = result.solved and not reached
             looks.append(0)
         else:
-            events = list(
-                explore(leg, explorer, noise, number, images_so_far[0] if chosen_method.standing else None)
-            )
+            events = list[Event]()
+            for event in explore(leg, explorer, noise, number):
+                events.append(event)
+                # after each motion, the arm hides another part of the scene from the standing camera
+                if chosen_method.standing and event.step.motion is not None:
+                    camera_beside = beside.T_base_camera, beside.intrinsics, beside.depth.shape[::-1]
+                    seen = ray_cast(leg.scene, *camera_beside, leg.robot, event.configuration)
+                    explorer.observe(measured(seen, np.inf, noise, rng))
             reached = events[-1].step.kind == DONE
             collided = not all(event.free for event in events)
             looks.append(sum(event.step.kind == LOOK for event in events))

@@ -62,7 +62,7 @@ from robotdiffuse.planning.search.rrt import AORRTC
 from robotdiffuse.problems.files import Case, goal_of
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
+from robotdiffuse.scenes.packed_scenes import BOX, SPHERE, PackedScenes
 
 PANDA = load_robot("panda")
 FAMILY = "rop"

@@ -38,7 +38,7 @@ def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
     from robotdiffuse.collision.kernel_arrays import compile_robot
     from robotdiffuse.learning.guidance import CollisionGuidance
     from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
-    from robotdiffuse.scenes.scene_arrays import PackedScenes
+    from robotdiffuse.scenes.packed_scenes import PackedScenes
     from robotdiffuse.validation.validator import Verifier
 
     rng = np.random.default_rng(seed)

@@ -24,7 +24,7 @@ from robotdiffuse.learning.training.config import planner_training
 from robotdiffuse.learning.training.loop import Processes
 from robotdiffuse.learning.training.tasks import PlannerLoss, model_settings, planning_success
 from robotdiffuse.learning.weight_files import RobotIdentity
-from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.packed_scenes import PackedScenes
 
 RANGES = RobotIdentity.of(PANDA)
 BALL = Sphere([0.5, 0.0, 0.4], 0.15, name="ball")

@@ -23,7 +23,7 @@ from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.learned import scene_clouds
 from robotdiffuse.planning.start_goal import StartGoal
-from robotdiffuse.scenes.scene_arrays import BOX, PackedScenes
+from robotdiffuse.scenes.packed_scenes import BOX, PackedScenes
 
 UP = np.array([0.0, -0.9, 0.0, -1.9, 0.0, 2.2, 0.785])
 WALL = Scene([Box([0.5, 0.0, 0.2], [0.3, 0.05, 0.4], name="wall")])

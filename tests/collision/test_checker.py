@@ -28,7 +28,7 @@ from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.losses import ArmDistance, ForwardKinematics
 from robotdiffuse.problems.families.family import base_spheres
 from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
-from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.packed_scenes import PackedScenes
 
 
 @pytest.mark.parametrize("name", oracles.ROBOTS)

@@ -330,7 +330,6 @@ import sys
 import robotdiffuse as rd
 from numba.core.types import Array
 from numba.core.dispatcher import Dispatcher
-from robotdiffuse.validation.validator import verify_trajectory
 
 task = rd.Problem(
     rd.load_robot("panda"),
@@ -339,7 +338,7 @@ task = rd.Problem(
     [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8],
 )
 result = rd.load_planner("aorrtc").plan(task, 60.0, until="first")
-assert verify_trajectory(task, result.trajectory).valid
+assert rd.verify(task, result.trajectory).valid
 modules = [module for name, module in sys.modules.items() if name.startswith("robotdiffuse.")]
 compiled = {one for module in modules for one in vars(module).values() if isinstance(one, Dispatcher)}
 signatures = [signature for one in compiled for signature in one.signatures]

@@ -15,7 +15,7 @@ from robotdiffuse.datasets import external as robot_npz
 from robotdiffuse.datasets.external import export_npz, import_npz
 from robotdiffuse.datasets.shards import SPLITS, check_shard, problem_of, read_manifest, read_shard, write_shard
 from robotdiffuse.evaluation.checks import check_data
-from robotdiffuse.scenes.scene_arrays import SPHERE
+from robotdiffuse.scenes.packed_scenes import SPHERE
 
 
 def made(folder: Path) -> Path:

@@ -19,7 +19,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.datasets import shards
 from robotdiffuse.datasets.loader import RopBatch, RopDataset
 from robotdiffuse.problems.families.rop import ROP_DENSE
-from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
+from robotdiffuse.scenes.packed_scenes import BOX, SPHERE, PackedScenes
 
 ARM = box_arm()
 WAYPOINTS = 20

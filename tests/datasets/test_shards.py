@@ -23,7 +23,7 @@ from robotdiffuse.datasets import shards
 from robotdiffuse.datasets.external import import_npz
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import robot_fingerprint
-from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.packed_scenes import PackedScenes
 
 ARM = box_arm()
 WAYPOINTS = 12

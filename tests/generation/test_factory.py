@@ -33,7 +33,7 @@ from robotdiffuse.datasets.shards import check_shard, path_of, problem_of, read_
 from robotdiffuse.generation import GenerationSettings, factory, generate
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
 from robotdiffuse.robots import names_a_file
-from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.packed_scenes import PackedScenes
 
 MIX = {"rop": 0.5, "rop_dense": 0.5}
 SETTINGS = GenerationSettings(trajectories=12, shard=4, waypoints=32, seed=3, mix=MIX, goals=4)

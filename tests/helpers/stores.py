@@ -11,7 +11,7 @@ from robotdiffuse import Box, Robot, Scene, Sphere
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.datasets.shards import Manifest, write_manifest, write_shard
 from robotdiffuse.robots.robot import robot_fingerprint
-from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
+from robotdiffuse.scenes.packed_scenes import BOX, SPHERE, PackedScenes
 
 WAYPOINTS = 254
 SLOTS = 4

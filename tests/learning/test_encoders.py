@@ -26,7 +26,7 @@ from robotdiffuse.learning.training.batches import Batches, load_data, random_sc
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.tasks import train_encoder, train_planner
 from robotdiffuse.learning.weight_files import RobotIdentity
-from robotdiffuse.scenes.scene_arrays import SPHERE
+from robotdiffuse.scenes.packed_scenes import SPHERE
 from robotdiffuse.scenes.surface_points import PANDA_REGION
 
 SMALL = {

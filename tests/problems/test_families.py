@@ -17,7 +17,7 @@ from robotdiffuse.problems.families import FAMILIES, family as drawing, furnitur
 from robotdiffuse.problems.families.rop import ROP, Rop
 from robotdiffuse.problems.families.scaled import ScaledFamily, family_for, scale_for
 from robotdiffuse.robots.robot import LinkPairTable, scaled
-from robotdiffuse.scenes.scene_arrays import BOX, PackedScenes
+from robotdiffuse.scenes.packed_scenes import BOX, PackedScenes
 from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.scenes.surface_points import VisibleRegion, sample_surface
 

@@ -17,7 +17,6 @@ from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.validation.tolerances import goal_error
-from robotdiffuse.validation.validator import verify_trajectory
 
 ROBOT = rd.load_robot("panda")
 START = [-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
@@ -79,7 +78,7 @@ def test_one_motion_stops_at_waypoints_in_their_order() -> None:
     problem = rd.Problem(ROBOT, rd.Scene([POST]), START, END, waypoints=way)
     result = rd.plan(problem, time_limit=10.0)
     assert result.path is not None and result.trajectory is not None, result.reason
-    assert rd.verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
+    assert rd.verify(problem, result.path).valid and rd.verify(problem, result.trajectory).valid
     assert stops(result.trajectory, np.array(MIDDLE)) and stops(result.trajectory, np.array(END))
     assert (np.diff(result.trajectory.times) > 0).all()
     assert "4 segments" in result.reason
@@ -104,28 +103,28 @@ def test_blended_waypoints_are_passed_within_their_blend_without_a_stop(blend: f
     problem = replace(stopped, blend=blend)
     one, other = (rd.plan(p, time_limit=10.0).trajectory for p in (problem, stopped))
     assert one is not None and other is not None
-    assert verify_trajectory(problem, one).valid and verify_trajectory(stopped, other).valid and one.duration < other.duration
+    assert rd.verify(problem, one).valid and rd.verify(stopped, other).valid and one.duration < other.duration
     assert np.linalg.norm(one.velocities[1:-1], axis=1).min() > 1e-3
     for k, goal in enumerate(way):
         assert nearest(one, goal) <= blend + 1e-5
         closer = [0.9 * nearest(one, goal) if i == k else 0.5 for i in range(2)]
-        found = verify_trajectory(replace(problem, blend=closer), one).violation
+        found = rd.verify(replace(problem, blend=closer), one).violation
         assert found is not None and found.message.startswith("the motion does not pass within ")
-    found = verify_trajectory(stopped, one).violation
+    found = rd.verify(stopped, one).violation
     assert found is not None and found.message == "the motion does not stop at waypoints[0]"
 
 
 def test_each_waypoint_has_its_own_blend_no_wider_than_is_free() -> None:
     problem = rd.Problem(ROBOT, rd.Scene([POST]), START, END, waypoints=[MIDDLE, START, MIDDLE], blend=[0, 0.1, 0])
     result = rd.plan(problem, time_limit=10.0)
-    assert result.trajectory is not None and verify_trajectory(problem, result.trajectory).valid
+    assert result.trajectory is not None and rd.verify(problem, result.trajectory).valid
     assert stops(result.trajectory, np.array(MIDDLE)) and "4 segments" in result.reason
     resting = result.trajectory.times[np.linalg.norm(result.trajectory.velocities, axis=1) <= 1e-3]
     assert len(resting) >= 4 and np.abs(resting - result.trajectory.times[[0, -1]].mean()).min() > 0.1
     wall = rd.Box(ROBOT.fk(MIDDLE, "panda_hand")[:3, 3] - [0.0, 0.0, 0.18], [0.02, 0.3, 0.1], name="wall")
     problem = rd.Problem(ROBOT, rd.Scene([wall]), START, END, waypoints=[MIDDLE], blend=1.0)
     result = rd.plan(problem, time_limit=10.0)
-    assert result.trajectory is not None and verify_trajectory(problem, result.trajectory).valid
+    assert result.trajectory is not None and rd.verify(problem, result.trajectory).valid
 
 
 def test_the_leg_that_fails_is_named_and_not_repeated_for_a_configuration_in_collision() -> None:

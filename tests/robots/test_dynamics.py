@@ -16,7 +16,7 @@ from robotdiffuse.problems.files import load_problem, problem_from_record, probl
 from robotdiffuse.robots.dynamics import GRAVITY, Dynamics
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
-from robotdiffuse.validation.validator import verify, verify_trajectory
+from robotdiffuse.validation.validator import verify
 
 pinocchio: Any = pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
 PANDA = rd.load_robot("panda")
@@ -63,7 +63,7 @@ def test_motions_with_a_payload_are_slower_and_keep_the_limits() -> None:
         problem = rd.Problem(PANDA, rd.Scene(), LOW, FAR, payload=rd.Payload(mass, [0.0, 0.0, 0.1]))
         for jerk in (None, 300.0):
             motion = rd.plan(problem, time_limit=10.0, jerk=jerk).trajectory
-            assert motion is not None and verify_trajectory(problem, motion).valid
+            assert motion is not None and verify(problem, motion).valid
             dynamics = Dynamics(PANDA, rd.Payload(mass, [0.0, 0.0, 0.1]))
             torques = dynamics.torques(motion.positions, motion.velocities, motion.accelerations)
             assert (np.abs(torques) <= 1.01 * dynamics.limits).all()
@@ -75,7 +75,7 @@ def test_motions_with_a_payload_are_slower_and_keep_the_limits() -> None:
 def test_the_validator_names_joint_torque_and_limit() -> None:
     free = rd.Problem(PANDA, rd.Scene(), LOW, FAR)
     result = rd.plan(free, time_limit=10.0)
-    found = verify_trajectory(replace(free, payload=rd.Payload(3.0, [0.0, 0.0, 0.1])), result.trajectory).violation
+    found = verify(replace(free, payload=rd.Payload(3.0, [0.0, 0.0, 0.1])), result.trajectory).violation
     assert found is not None and found.kind == "torque" and found.subject == "panda_joint2"
     assert found.message.endswith("N m, its effort limit is 87 N m, with the payload")
     # the limit is too low in the middle, where the rod is level

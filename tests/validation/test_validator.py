@@ -20,7 +20,7 @@ from robotdiffuse.trajectories.speed_limits import TimingSettings
 from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.rates import rate_violations
 from robotdiffuse.validation.report import Report, Violation
-from robotdiffuse.validation.validator import VerifySettings, verifier, verify_trajectory, violations
+from robotdiffuse.validation.validator import VerifySettings, verifier, violations
 
 RATES = VerifySettings()
 
@@ -267,7 +267,7 @@ def test_motions_of_another_shape_or_other_joints_raise() -> None:
     ):
         good = trajectory(2.0)
         object.__setattr__(good, name, np.asarray(cut(getattr(good, name))))
-        refuses(rf"trajectory\.{name} has shape .*; it must be", verify_trajectory, problem, good)
+        refuses(rf"trajectory\.{name} has shape .*; it must be", rd.verify, problem, good)
 
 
 @pytest.mark.parametrize(("factor", "jumps"), [(1.0, False), (1.02, False), (1.49, False), (1.6, True)])

@@ -343,7 +343,7 @@ class AStar(Planner[DStarLiteSettings]):
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        for settings, _ in ever_finer(context, self.settings):
+        for settings in ever_finer(context, self.settings):
             search = LatticeSearch(start_goal.checker, *start_goal.leads(), settings)
             outcome = search.run(lambda: context.remaining <= 0)
             after = f"after {counted(search.expansions, 'expansion')}"

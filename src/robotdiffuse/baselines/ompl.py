@@ -171,7 +171,7 @@ class OmplPlanner(Planner[OmplSettings]):
             return self._best(context, start_goal) if self.anytime else self._first(context, start_goal)
 
     def _first(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
-        for settings, attempt in ever_finer(context, self.settings):
+        for attempt, settings in enumerate(ever_finer(context, self.settings)):
             search = _Search(context, start_goal, self, settings, attempt)
             if not search.run():
                 return context.unsolved(search.gave_up)

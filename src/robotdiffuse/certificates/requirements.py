@@ -103,25 +103,25 @@ def constraint_bounds(
     }
     quantities = list[tuple[str, Values, float]]()
     for constraint in problem.constraints:
-        along = _frame_motion(linkage, placed[constraint.frame], q, constraint.frame)
+        motion = _frame_motion(linkage, placed[constraint.frame], q, constraint.frame)
         name = f"{constraint.kind} of {constraint.frame}"
         if isinstance(constraint, AxisCone):
-            cosines = along.R @ constraint.axis @ constraint.direction
-            min_cosine = np.minimum(cosines[1:], cosines[:-1]) - along.turn**2 / 8
-            bounds = np.arccos(np.clip(min_cosine, -1.0, 1.0)) + chord * along.joints
+            cosines = motion.R @ constraint.axis @ constraint.direction
+            min_cosine = np.minimum(cosines[1:], cosines[:-1]) - motion.turn**2 / 8
+            bounds = np.arccos(np.clip(min_cosine, -1.0, 1.0)) + chord * motion.joints
             quantities.append((name, bounds, constraint.angle))
             continue
         ends = _line_poses(problem, linkage, constraint) if isinstance(constraint, CartesianLine) else ()
-        distances_to_box = _distances(along.p, *_allowed_box(constraint, *ends))
+        distances_to_box = _distances(motion.p, *_allowed_box(constraint, *ends))
         bounds = (
             np.maximum(distances_to_box[1:], distances_to_box[:-1])
-            + along.deviation
-            + chord * along.sensitivity
+            + motion.deviation
+            + chord * motion.sensitivity
         )
         limit = 0.0 if isinstance(constraint, PositionBox) else constraint.tolerance
         quantities.append((name, bounds, limit))
         if isinstance(constraint, CartesianLine) and constraint.angle is not None:
-            bounds = _angle_bounds(along, chord, *ends)
+            bounds = _angle_bounds(motion, chord, *ends)
             quantities.append((f"{name}, its angle", bounds, constraint.angle))
     names, columns, limits = zip(*quantities, strict=True)
     return names, np.column_stack(columns), limits
@@ -239,7 +239,7 @@ def _line_poses(problem: Problem, linkage: Linkage, line: CartesianLine) -> tupl
     raise InputError(f"cartesian_line of {line.frame}: the goal does not determine one pose of it")
 
 
-def _angle_bounds(along: _FrameMotion, chord: float, *ends: Pose) -> Values:
+def _angle_bounds(motion: _FrameMotion, chord: float, *ends: Pose) -> Values:
     """Upper bounds, for each step, on the angle between the frame's orientation and the orientation that is
     interpolated for its position on the line."""
     T_start, T_goal = ends
@@ -251,18 +251,18 @@ def _angle_bounds(along: _FrameMotion, chord: float, *ends: Pose) -> Values:
     axis = np.linalg.eigh(turn + turn.T)[1][:, -1]
     axis = axis if _skew(turn) @ axis >= 0 else -axis  # an eigenvector's sign is arbitrary
     if length < MIN_LINE_LENGTH:  # rotation in place: the nearest orientation between start and goal
-        turned = along.R @ R_start.T
+        turned = motion.R @ R_start.T
         cosines = np.trace(turned, axis1=1, axis2=2) - turned @ axis @ axis
         angles = np.clip(np.arctan2(_skew(turned) @ axis, cosines), 0.0, total_angle)
         angle_per_length = 0.0
     else:
-        fraction = np.clip((along.p - T_start[:3, 3]) @ displacement / length**2, 0.0, 1.0)
+        fraction = np.clip((motion.p - T_start[:3, 3]) @ displacement / length**2, 0.0, 1.0)
         angles = fraction * total_angle
         angle_per_length = total_angle / length
     target_rotations = rotation_about(axis, angles[:, None, None]) @ R_start
-    errors = _angles(along.R, target_rotations)
-    return (errors[1:] + errors[:-1] + along.turn + angle_per_length * along.travel) / 2 + chord * (
-        along.joints + angle_per_length * along.sensitivity
+    errors = _angles(motion.R, target_rotations)
+    return (errors[1:] + errors[:-1] + motion.turn + angle_per_length * motion.travel) / 2 + chord * (
+        motion.joints + angle_per_length * motion.sensitivity
     )
 
 

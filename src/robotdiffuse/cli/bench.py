@@ -1,12 +1,11 @@
 """The commands `robotdiffuse bench` and `reproduce`, which makes the paper's tables and figures again."""
 
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
 from robotdiffuse.cli.arguments import Namespace, check_workers, chosen
-from robotdiffuse.cli.console import progress
+from robotdiffuse.cli.console import progress, say
 from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.files import write_atomically
 from robotdiffuse.core.tables import Table, show
@@ -35,12 +34,8 @@ def run_run(arguments: Namespace) -> None:
     calls_made = 0
     for settings in _bench_settings(arguments):
         with progress("calls") as update:
-            calls_made += run_bench(settings, _say, update)
+            calls_made += run_bench(settings, say, update)
     print(f"{counted(calls_made, 'call')} made; tables and plots: robotdiffuse bench report {arguments.out}")
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 def _bench_settings(arguments: Namespace) -> list[BenchSettings]:
@@ -137,7 +132,7 @@ def _table1(arguments: Namespace) -> tuple[paper.Table1Settings, Bench]:
     """The settings of table 1, and the records of its calls; calls that the folder lacks are made first."""
     settings = paper.Table1Settings(**_changes(arguments, paper.Table1Settings))
     with progress("calls") as update:
-        return settings, paper.run_table1(settings, _say, update)
+        return settings, paper.run_table1(settings, say, update)
 
 
 def run_table2(arguments: Namespace) -> int:
@@ -147,7 +142,7 @@ def run_table2(arguments: Namespace) -> int:
     from robotdiffuse.evaluation.ablation import ROWS, AblationSettings, run_ablation, table2
 
     settings = AblationSettings(**chosen(arguments, AblationSettings.__dataclass_fields__))
-    results = run_ablation(settings, list(arguments.rows or ROWS), arguments.workers, _say)
+    results = run_ablation(settings, list(arguments.rows or ROWS), arguments.workers, say)
     return _write(table2(settings, results), Path(settings.out) / "table2.md")
 
 

@@ -121,7 +121,7 @@ PLANNING = (
         "explore",
         "explore an unknown scene with a simulated wrist camera",
         "Simulate an arm that goes from a problem's start to its goal and knows of the scene only what depth "
-        "cameras have seen: one at its tip, and one beside it that takes one image. Shapes named floor are "
+        "cameras have seen: one at its tip, and one beside the arm, for one image. Shapes named floor are "
         "known. Each motion is validated in the true scene. Exit status: 0 at the goal, 1 not, 2 bad input.",
         "explore:run_explore",
         (
@@ -253,8 +253,8 @@ CHECKS = (
             Command(
                 "check",
                 "re-check a certificate, without search",
-                "Re-check a certificate with code that shares only data types with the validator. Exit "
-                "status: 0 if it holds, 1 if not, 2 for bad input.",
+                "Re-check a certificate with code that shares little more than data types with the "
+                "validator. Exit status: 0 if it holds, 1 if not, 2 for bad input.",
                 "verify:run_check",
                 (
                     ("file FILE", "certificate of `robotdiffuse verify --certificate`"),

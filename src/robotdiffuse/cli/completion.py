@@ -65,9 +65,9 @@ def run_completion(arguments: Namespace) -> None:
 def _words(parser: ArgumentParser, path: str) -> Iterator[tuple[str, tuple[list[str], list[str]]]]:
     """Yields for each command its path, such as " data info", and two lists: the words that may follow
     (subcommands or choices), and its options."""
-    words: list[str] = []
-    options: list[str] = []
-    below: dict[str, ArgumentParser] = {}
+    words = list[str]()
+    options = list[str]()
+    below = dict[str, ArgumentParser]()
     for action in parser._actions:
         if isinstance(action, Commands):
             below |= action.choices

@@ -78,6 +78,11 @@ class Spinner:
         return f"{self.text}: compiling, once on this machine; {count} so far ({compiled[-1]})"
 
 
+def say(text: str) -> None:
+    """Print a line on standard error at once."""
+    print(text, file=sys.stderr, flush=True)
+
+
 @contextmanager
 def progress(what: str) -> Iterator[Callable[[int, int], None]]:
     """Yields a function `update(done, total)` that moves a progress bar on standard error. If standard error
@@ -94,7 +99,7 @@ def progress(what: str) -> Iterator[Callable[[int, int], None]]:
         bar.update(task, completed=done, total=total)
         if not console.is_terminal and time.monotonic() >= due:
             due = time.monotonic() + COUNT_INTERVAL
-            print(f"{what}: {done:,} of {total:,}", file=sys.stderr, flush=True)
+            say(f"{what}: {done:,} of {total:,}")
 
     with Progress(
         *columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal

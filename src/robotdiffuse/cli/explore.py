@@ -98,7 +98,7 @@ def record(explorer: RecordedExplorer, file: Path) -> None:
     """Write all views that an explorer observed; the camera on the arm is `wrist`, others are `beside`."""
     from robotdiffuse.interop.depth_recording import StampedView, write_depth_views
 
-    views: dict[str, list[StampedView]] = {}
+    views = dict[str, list[StampedView]]()
     for taken_view in explorer.views:
         views.setdefault("beside" if taken_view.camera is None else "wrist", []).append(
             StampedView(taken_view.time, taken_view.view)
@@ -154,7 +154,7 @@ def explore_shelf(problem: Problem, outputs: list[Path]) -> int:
     obstacles = [shape for shape in problem.scene.shapes if shape.name != FLOOR.name]
     start = READY if READY in problem.robot.poses else problem.start
     problem = Problem(problem.robot, Scene([FLOOR, *obstacles]), start, problem.goal)
-    print("The arm knows the floor. A camera at its tip and one beside it observe the rest.")
+    print("The arm knows the floor. A camera at its tip and one beside the arm observe the rest.")
     explorer, arrived = simulate(problem, ExplorerSettings(time_limit=EXPLORE_TIME_LIMIT), None, 0)
     views = sum(record.step.kind == LOOK for record in explorer.steps)
     end = "is at the goal" if arrived else "is not at the goal"

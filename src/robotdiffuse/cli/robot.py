@@ -1,17 +1,15 @@
 """The commands `robotdiffuse robot list`, `info` and `add`."""
 
-import sys
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from jaxtyping import Float
-from numpy import ndarray
-
 from robotdiffuse.cli.arguments import Namespace, chosen
+from robotdiffuse.cli.console import say
 from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.interrupts import exit_on_interrupt
 from robotdiffuse.core.tables import Column, Table, show
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation
+from robotdiffuse.core.types import Pose
 from robotdiffuse.learning.weight_files import weights_for
 from robotdiffuse.robots import known_robots, load_robot
 from robotdiffuse.robots.robot import Robot
@@ -69,7 +67,7 @@ def run_add(arguments: Namespace) -> None:
             if console.is_terminal:
                 bar.update(task, description=what, completed=step, total=steps)
             else:
-                print(f"{step} of {steps}: {what}", file=sys.stderr, flush=True)
+                say(f"{step} of {steps}: {what}")
 
         report = add_robot(
             arguments.urdf,
@@ -118,7 +116,7 @@ def print_preparation(report: "AddReport") -> None:
         Table.pairs("", summary),
     )
     for warning in report.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+        say(f"warning: {warning}")
 
 
 def _print_pairs(report: "AddReport") -> None:
@@ -164,7 +162,7 @@ def print_robot(robot: Robot) -> None:
     show(Table.of(robot.name, columns, joints), Table.pairs("", pairs))
 
 
-def _place(T: Float[ndarray, "4 4"]) -> str:
+def _place(T: Pose) -> str:
     wxyz = quaternion_from_rotation(T)
     xyz = T[:3, 3]
     return " ".join(["xyz", *(f"{value:g}" for value in xyz), "wxyz", *(f"{value:.4g}" for value in wxyz)])

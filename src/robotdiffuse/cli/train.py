@@ -2,12 +2,11 @@
 
 import os
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
 from robotdiffuse.cli.arguments import Namespace, chosen
-from robotdiffuse.cli.console import progress
+from robotdiffuse.cli.console import progress, say
 from robotdiffuse.core.errors import InputError, counted, needs, shown
 from robotdiffuse.core.files import lock_folder, write_atomically
 from robotdiffuse.generation import GenerationSettings, generate
@@ -208,11 +207,7 @@ def train_for_robot(
     Processes(settings.device)
     if "encoder" in options and settings.encoder is not None and not settings.jointly:
         load_encoder(settings.encoder)
-    print(
-        f"{robot.name}: {counted(data.trajectories, 'motion')}, then training; all in {work}",
-        file=sys.stderr,
-        flush=True,
-    )
+    say(f"{robot.name}: {counted(data.trajectories, 'motion')}, then training; all in {work}")
     with progress("trajectories") as update:
         generate(data, work / "data", workers or os.cpu_count() or 1, progress=update)
     if "encoder" not in options:

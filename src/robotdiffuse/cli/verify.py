@@ -17,7 +17,7 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import DATA, ROBOTS, load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import contact_notes
-from robotdiffuse.validation.validator import verify, verify_trajectory, violations
+from robotdiffuse.validation.validator import verify, violations
 
 
 def run_verify(arguments: Namespace) -> int:
@@ -198,7 +198,7 @@ def validated_motion(file: str, rate: float | None = None) -> tuple[Problem, Tra
     if result.trajectory is None:
         raise InputError(f"{file} holds a path without times; plan again to get a trajectory")
     trajectory = result.trajectory if rate is None else result.trajectory.resample(rate)
-    violation = verify_trajectory(problem, trajectory).violation
+    violation = verify(problem, trajectory).violation
     if violation is not None:
         rows = "" if rate is None else f" with rows at {rate:g} Hz"
         raise InputError(f"{file} is refused: its motion{rows} is not valid: {violation.message}")

@@ -11,8 +11,8 @@ from robotdiffuse.collision.kernels.frames import write_rotation
 from robotdiffuse.collision.kernels.lane_clearance import make_clearance_workspace
 from robotdiffuse.collision.kernels.simd import W
 from robotdiffuse.core.kernels import inner_kernel, kernel
+from robotdiffuse.scenes.packed_scenes import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.shapes import Box
 
 _ONE = np.float32(1.0)

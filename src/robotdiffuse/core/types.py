@@ -398,8 +398,8 @@ class Trajectory(Value):
         At a low rate, the cubics between the new rows may need larger accelerations than this motion has,
         where its acceleration changes quickly. A motion from rest to rest is then averaged: its rows lie on
         the uniform cubic B-spline that has the resampled positions as control points. An averaged motion
-        leaves the path by up to acceleration / (6 rate²). It lasts up to three steps longer, plus two for
-        each stop. Validate the returned motion: between its rows it may differ from this one.
+        leaves the path by up to acceleration / (6 rate²). It lasts up to three steps longer than this one,
+        plus three for each stop. Validate the returned motion: between its rows it may differ from this one.
 
         Args:
             rate: Rows in a second [Hz], above 0 and at most 100,000.
@@ -694,8 +694,8 @@ class PlanResult:
     """Sum of the predicted occupancy probabilities of all unknown voxels that the motion sweeps; None unless
     the policy for unknown space is `predicted`."""
     unknown_region: tuple[tuple[float, ...], tuple[float, ...]] | None = None
-    """Lower and upper corner, in the base frame [m], of a box around the part of the unknown space
-    that the motion crosses with the largest summed probability to be occupied; None if it crosses none."""
+    """Lower and upper corner, in the base frame [m], of a box around the part of unknown space with the
+    largest summed occupancy probability among those that the motion crosses; None if it crosses none."""
     fraction: float | None = None
     """Problems with a Cartesian line: the fraction of the line that the arm can follow from the start, 1 if
     there is a motion. If it is below 1, `reason` says what stops the arm."""

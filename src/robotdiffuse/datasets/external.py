@@ -43,8 +43,8 @@ from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.problem import LIMIT_SLACK, checked_configuration
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot, check_joints, robot_fingerprint
+from robotdiffuse.scenes.packed_scenes import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.shapes import Box, Sphere
 
 ROWS_PER_SHARD = 500

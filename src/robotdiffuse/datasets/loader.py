@@ -17,7 +17,7 @@ from robotdiffuse.core.types import frozen_dataclass
 from robotdiffuse.datasets.shards import SPLITS, read_manifest, read_rows
 from robotdiffuse.robots.kinematic_tree import JointNormalizer
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.packed_scenes import PackedScenes
 
 with needs("torch", "train"):
     import torch

@@ -56,8 +56,8 @@ from robotdiffuse.core.types import (
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot, robot_fingerprint
+from robotdiffuse.scenes.packed_scenes import PackedScenes, floor_row
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.scene_arrays import PackedScenes, floor_row
 from robotdiffuse.scenes.shapes import Box
 
 FORMAT = 1

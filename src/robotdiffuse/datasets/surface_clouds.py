@@ -11,7 +11,7 @@ from torch import Generator, Tensor
 
 from robotdiffuse.collision.kernels.frames import write_rotation
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
+from robotdiffuse.scenes.packed_scenes import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.surface_points import VisibleRegion
 
 # Largest number of samples that are drawn for each requested point; samples outside the region are dropped.

@@ -57,7 +57,7 @@ from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.processes.workers import CLUSTERS, Results, on_this_machine
 from robotdiffuse.robots import load_robot, names_a_file
 from robotdiffuse.robots.robot import Robot, robot_fingerprint
-from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.packed_scenes import PackedScenes
 from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.validator import Verifier, VerifySettings
 

@@ -33,7 +33,7 @@ from robotdiffuse.learning.diffusion import (
 from robotdiffuse.learning.encoders import ENCODERS, EncoderSettings, PointAutoencoderSettings
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.packed_scenes import PackedScenes
 
 Joints = Float[ndarray, "*batch dof"]
 Trajectories = Float[ndarray, "*batch waypoints dof"]

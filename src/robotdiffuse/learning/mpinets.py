@@ -52,7 +52,7 @@ from robotdiffuse.learning.training.losses import ArmDistance, ForwardKinematics
 from robotdiffuse.learning.training.tasks import BaselineNetwork
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.packed_scenes import PackedScenes
 from robotdiffuse.scenes.surface_points import VisibleRegion
 
 Configurations = Float32[Tensor, "n dof"]

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
@@ -93,7 +93,7 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
     targets = _poses(T_start, T_end)
     fraction = 0.0
     why = ""
-    candidates = list[tuple[float, Float[ndarray, "n dof"]]]()
+    candidates = list[tuple[float, Configurations]]()
     chain = ik_chain(robot, line.frame, LIMIT_MARGIN)
     limits = scaled_limits(robot, context.timing)
 
@@ -196,9 +196,9 @@ def faster_ends(
     arm: Int[ndarray, "j"],
     joints: IKChain,
     best_cost: float,
-    rows: Float[ndarray, "k dof"],
-    cost: Callable[[Float[ndarray, "k dof"]], float],
-) -> list[tuple[float, Float[ndarray, "k dof"]]]:
+    rows: Configurations,
+    cost: Callable[[Configurations], float],
+) -> list[tuple[float, Configurations]]:
     """Costs and motions along the line that end in the last configuration of `rows`, or in other
     configurations of the end pose.
 
@@ -210,7 +210,7 @@ def faster_ends(
     constrained = 3 if line.angle is None else 6
     parameters = PARAMETERS._replace(position_only=line.angle is None)
     jacobian = problem.robot.jacobian(end, line.frame)[:constrained, arm]
-    faster = list[tuple[float, Float[ndarray, "k dof"]]]()
+    faster = list[tuple[float, Configurations]]()
     redundant = np.linalg.svd(jacobian)[2][constrained:]
     # with the zero offset, the line is followed to the same end again, but joints are steered to this end
     # from the start on

@@ -1,7 +1,7 @@
 """Planning for many problems at once, over processes of this machine or a Ray cluster."""
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from contextlib import closing
 from dataclasses import fields, replace
@@ -16,6 +16,7 @@ from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import PlanResult, Status
 from robotdiffuse.planning import DEFAULT_PLANNER, load_planner
 from robotdiffuse.planning.context import PlanRequest
+from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.processes.workers import (
     CLUSTERS,
@@ -94,111 +95,100 @@ def plan_many(
     for name in request:
         check_name("argument", name, names)
     load_planner(planner, settings, weights)
+    asked = PlanRequest(**request)
     if cluster is not None:
         check_name("cluster", cluster, CLUSTERS)
         if workers is not None:
             raise InputError(f"workers is {workers} and cluster is {cluster}; a cluster uses all its cores")
-        results = _planned_on_cluster(problems, (planner, settings, weights), cluster, PlanRequest(**request))
+        outcomes = _planned_on_cluster(problems, (planner, settings, weights), cluster, asked)
     else:
         count = min(workers or os.cpu_count() or 1, len(problems))
-        results = _planned(problems, (planner, settings, weights), count, PlanRequest(**request))
-    return in_order(_reported(results, len(problems), progress))
+        outcomes = _planned(problems, (planner, settings, weights), count, asked)
+
+    def results() -> Results:
+        with closing(outcomes):
+            for completed, (i, outcome) in enumerate(outcomes, start=1):
+                if progress is not None:
+                    progress(completed, len(problems))
+                if isinstance(outcome, str):
+                    name = problems[i].robot.name
+                    outcome = PlanResult(Status.ERROR, outcome, planner, name, 0.0, asked.seed)
+                yield i, replace(outcome, problem=problems[i])
+
+    return in_order(results())
 
 
-def _reported(results: Results, total: int, progress: Callable[[int, int], object] | None) -> Results:
-    with closing(results):
-        for completed, result in enumerate(results, start=1):
-            if progress is not None:
-                progress(completed, total)
-            yield result
+Task = tuple[int, dict[str, Any]]
+"""A problem as it is sent to a process: the index of its robot, and its other fields by name."""
+
+
+def _tasks(problems: Sequence[Problem]) -> tuple[list[Robot], list[Task]]:
+    """The robots of the problems, each once and without cached arrays, since a process computes and caches
+    its own arrays; and the problems."""
+    number = {robot: i for i, robot in enumerate(dict.fromkeys(problem.robot for problem in problems))}
+    names = [field.name for field in fields(Problem) if field.name != "robot"]
+    tasks = [
+        (number[problem.robot], {name: getattr(problem, name) for name in names}) for problem in problems
+    ]
+    return [replace(robot) for robot in number], tasks
 
 
 def _planned(
     problems: list[Problem], arguments: PlannerArguments, workers: int, request: PlanRequest
 ) -> Results:
-    # Each process gets each robot once, without cached arrays; the process computes and caches its own
-    # arrays.
-    robots = list(dict.fromkeys(problem.robot for problem in problems))
-    number = {robot: i for i, robot in enumerate(robots)}
-    bare = [replace(robot) for robot in robots]
-    with Workers(workers, _prepare, (arguments, bare, request)) as pool:
-        calls = {}
-        for i, problem in enumerate(problems):
-            values = {
-                field.name: getattr(problem, field.name) for field in fields(problem) if field.name != "robot"
-            }
-            calls[pool.submit(_plan, number[problem.robot], values)] = i
+    robots, tasks = _tasks(problems)
+    with Workers(workers, _prepare, (arguments, robots, request)) as pool:
+        calls = {pool.submit(_plan, *task): i for i, task in enumerate(tasks)}
         for call in as_completed(calls):
-            problem = problems[calls[call]]
             error = call.exception()
             if error is None:
-                yield calls[call], replace(call.result(), problem=problem)
-                continue
-            reason = f"{type(error).__name__}: {error}"
-            if isinstance(error, EndedError):
-                reason = "the process of the planner died while planning this problem"
-            if isinstance(error, NotStartedError):
-                reason = str(error)
-            yield calls[call], replace(_error(arguments[0], problem, reason, request), problem=problem)
+                yield calls[call], call.result()
+            elif isinstance(error, NotStartedError):
+                yield calls[call], str(error)
+            elif isinstance(error, EndedError):
+                yield calls[call], "the process of the planner died while planning this problem"
+            else:
+                yield calls[call], f"{type(error).__name__}: {error}"
 
 
 def _planned_on_cluster(
     problems: list[Problem], arguments: PlannerArguments, cluster: str, request: PlanRequest
 ) -> Results:
-    bare = {robot: replace(robot) for robot in {problem.robot for problem in problems}}
-    sent = [replace(problem, robot=bare[problem.robot]) for problem in problems]
-    calls = [
-        (arguments, request, sent[i : i + PROBLEMS_PER_TASK]) for i in range(0, len(sent), PROBLEMS_PER_TASK)
-    ]
-    with closing(CLUSTERS[cluster](_plan_on_node, calls)) as batches:
-        for number, results in batches:
-            for i, result in enumerate(results, start=number * PROBLEMS_PER_TASK):
-                yield i, replace(result, problem=problems[i])
+    batches = [problems[i : i + PROBLEMS_PER_TASK] for i in range(0, len(problems), PROBLEMS_PER_TASK)]
+    calls = [(arguments, request, *_tasks(batch)) for batch in batches]
+    with closing(CLUSTERS[cluster](_plan_on_node, calls)) as answers:
+        for number, outcomes in answers:
+            yield from enumerate(outcomes, start=number * PROBLEMS_PER_TASK)
 
 
 def _plan_on_node(
-    arguments: PlannerArguments, request: PlanRequest, problems: list[Problem]
-) -> list[PlanResult]:
-    plan = _session(arguments, request)
-    results = []
-    for problem in problems:
+    arguments: PlannerArguments, request: PlanRequest, robots: list[Robot], tasks: list[Task]
+) -> list[PlanResult | str]:
+    _prepare(arguments, robots, request)
+    outcomes = list[PlanResult | str]()
+    for task in tasks:
         try:
-            results.append(plan(problem))
+            outcomes.append(_plan(*task))
         except Exception as error:
-            results.append(_error(arguments[0], problem, f"{type(error).__name__}: {error}", request))
-    return results
+            outcomes.append(f"{type(error).__name__}: {error}")
+    return outcomes
 
 
-def _error(planner: str, problem: Problem, reason: str, request: PlanRequest) -> PlanResult:
-    return PlanResult(Status.ERROR, reason, planner, problem.robot.name, 0.0, request.seed)
-
-
-def _session(arguments: PlannerArguments, request: PlanRequest) -> Callable[[Problem], PlanResult]:
-    """A function that plans with one loaded planner, which compiles its code before the first problem of each
-    robot."""
-    planner = load_planner(*arguments)
-    warm = set[Robot]()
-
-    def plan(problem: Problem) -> PlanResult:
-        """The result without its problem, which the caller has."""
-        if problem.robot not in warm:
-            planner.warm_up(problem)
-            warm.add(problem.robot)
-        return replace(planner.plan(problem, **vars(request)), problem=None)
-
-    return plan
-
-
-# What a worker process keeps between problems
-_state: tuple[Callable[[Problem], PlanResult], list[Robot]] | None = None
+# What a process keeps between problems: the planner, the robots, the request, and the indices of the robots
+# for which the planner has compiled its code
+_state: tuple[Planner[Any], list[Robot], PlanRequest, set[int]]
 
 
 def _prepare(arguments: PlannerArguments, robots: list[Robot], request: PlanRequest) -> None:
     global _state
-    _state = _session(arguments, request), robots
+    _state = load_planner(*arguments), robots, request, set()
 
 
 def _plan(robot: int, values: dict[str, Any]) -> PlanResult:
-    assert _state is not None
-    plan, robots = _state
-    return plan(Problem(robots[robot], **values))
+    """The result without its problem, which the caller has."""
+    planner, robots, request, warm = _state
+    problem = Problem(robots[robot], **values)
+    if robot not in warm:
+        planner.warm_up(problem)
+        warm.add(robot)
+    return replace(planner.plan(problem, **vars(request)), problem=None)

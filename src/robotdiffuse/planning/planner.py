@@ -237,15 +237,13 @@ class CheckedSettings(Settings):
     """Distance to obstacles that paths keep where start and goal allow it [m], as for `rrt_connect`."""
 
 
-def ever_finer(context: PlanningContext, settings: PlannerSettings) -> Iterator[tuple[PlannerSettings, int]]:
-    """Yields settings and the number of the attempt, from 0, until time runs out. For searches that are
-    repeated when the validator refuses their path: each attempt checks collisions at a finer resolution, down
-    to FINEST_RESOLUTION."""
-    attempt = 0
-    while attempt == 0 or context.remaining > 0:
-        yield settings, attempt
+def ever_finer(context: PlanningContext, settings: PlannerSettings) -> Iterator[PlannerSettings]:
+    """Yields settings until time runs out, at least once. For searches that are repeated when the validator
+    refuses their path: each attempt checks collisions at a finer resolution, down to FINEST_RESOLUTION."""
+    yield settings
+    while context.remaining > 0:
         settings = replace(settings, resolution=finer_resolution(settings.resolution))  # type: ignore
-        attempt += 1
+        yield settings
 
 
 def one_of_each(scene: Scene) -> Scene:

@@ -38,8 +38,8 @@ Function = Callable[..., Any]
 """A function that other processes can import: of a module, or a method of an object that can be pickled."""
 Results = Generator[tuple[int, Any], None, None]
 """Results in order of completion, each with the index of its call. After it is closed, the generator submits
-no more calls. Running calls stop when their processes end, or when the connection to a cluster ends that
-was made for these calls."""
+no more calls. Running calls stop when their processes end; on a cluster, when the connection that was made
+for these calls ends."""
 TERMINATE_TIMEOUT = 5.0
 """Time from asking a process to end until it is killed [s]."""
 PREPARE_TIMEOUT = 600.0
@@ -71,8 +71,8 @@ class OverrunError(EndedError):
 
 
 def check_not_importing() -> None:
-    """End this process if it is a worker that still imports the main script, and the script starts workers on
-    import because it lacks GUARD. The process that the user started reports it."""
+    """End this process if it is a worker that still imports the main script, which then lacks GUARD, since it
+    starts workers on import. The process that the user started reports it."""
     main = sys.modules["__main__"]
     if main is not sys.modules.get("__mp_main__", main):
         sys.exit(1)
@@ -313,8 +313,8 @@ class Workers:
         self.workers = [Worker(prepare, arguments) for _ in range(count)]
         self._patience = patience
         self._keep_ready = keep_ready
-        self._calls: queue.SimpleQueue[Call | None] = queue.SimpleQueue()
-        self._threads: list[threading.Thread] = []
+        self._calls = queue.SimpleQueue[Call | None]()
+        self._threads = list[threading.Thread]()
         self._begun = False
         self._closed = False
         self._not_started: NotStartedError | None = None
@@ -425,7 +425,7 @@ def on_this_machine(call: Function, calls: Sequence[tuple], workers: int) -> Res
 
 def in_order(results: Results) -> Iterator[Any]:
     """The results in the order of the calls."""
-    early: dict[int, Any] = {}
+    early = dict[int, Any]()
     following = 0
     for number, result in results:
         early[number] = result
@@ -456,7 +456,7 @@ class _Process:
 
     def __init__(self, connection: Connection) -> None:
         self.connection, self.sending = connection, threading.Lock()
-        self.calls: queue.SimpleQueue[tuple[int, bytes]] = queue.SimpleQueue()
+        self.calls = queue.SimpleQueue[tuple[int, bytes]]()
         self.running = self.cancelled = 0
         """Numbers that identify the running call, and the last call that was cancelled."""
         self.renew = False

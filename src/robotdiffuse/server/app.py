@@ -346,7 +346,7 @@ def _body(model: type[BaseModel] | None, description: str) -> JsonObject:
 
 
 def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> None:
-    running: dict[str, Callable[[], None]] = {}
+    running = dict[str, Callable[[], None]]()
 
     async def single(request: Request, endpoint: str, name: str) -> Response:
         body = await read_body(request, pool, JSON)

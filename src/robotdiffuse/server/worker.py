@@ -79,7 +79,7 @@ class Cancelled(BaseException):
 # Robots that requests may name
 _robots: dict[str, Robot]
 _settings: ServeSettings
-_warm: set[tuple[str, str]] = set()
+_warm = set[tuple[str, str]]()
 
 
 def prepare(robots: dict[str, Robot], settings: ServeSettings) -> bool:
@@ -249,7 +249,7 @@ def answer_verify(body: bytes) -> Answer:
     if not motions:
         raise InputError("the request has neither path nor trajectory")
     validator = Verifier(problem)
-    reports: dict[str, Report] = {}
+    reports = dict[str, Report]()
     for name, motion in motions.items():
         check_cancelled()
         reports[name] = getattr(validator, name)(motion)

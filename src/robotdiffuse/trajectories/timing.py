@@ -285,7 +285,7 @@ class StopGraph:
         self.stops = self._find_stops(deviations)
         """The values of s along the path at which motions may stop, in order."""
         sharp = self.line.knots[1:-1][deviations == 0]
-        self.motions: list[Motion] = []
+        self.motions = list[Motion]()
         for (i, low), (j, high) in combinations(enumerate(self.stops), 2):
             if not ((low < sharp) & (sharp < high)).any():  # a motion cannot pass a sharp corner
                 self.motions += self._between(robot, settings, i, j)

@@ -51,7 +51,7 @@ def rate_violations(
     the robot states none; the rates must then only agree with the positions. cubics: the trajectory's cubics,
     if they have been computed.
     """
-    first_violations: dict[str, Violation] = {}
+    first_violations = dict[str, Violation]()
     with np.errstate(all="ignore"):
         initial_velocity = np.zeros(robot.dof) if start_velocity is None else start_velocity
         for check in _checks(robot, cubics or Cubics(trajectory), settings, initial_velocity):

@@ -13,7 +13,7 @@ the values in between. If such a bound exceeds the limit, the piece is halved.
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -238,32 +238,15 @@ def verify(problem: Problem, motion: Path | Trajectory, settings: VerifySettings
     """
     check_problem(problem)
     check_type("settings", settings, VerifySettings, "VerifySettings")
-    check_motion("motion", motion, (Path, Trajectory))
-    validator = verifier(problem, settings)
-    return validator.trajectory(motion) if isinstance(motion, Trajectory) else validator.path(motion)
-
-
-def verify_trajectory(problem: Problem, trajectory: Trajectory, settings: VerifySettings = DEFAULT) -> Report:
-    """Validate a trajectory for a problem, with its rates and times, and among moving obstacles.
-
-    All limits must hold along the cubics through the positions and velocities of the rows. Velocities and
-    accelerations must agree with the positions. The motion must begin at rest, or with the problem's start
-    velocity, and end at rest. Raises InputError if the joints are not those of the robot, or for wrong
-    shapes.
-    """
-    check_motion("trajectory", trajectory, (Trajectory,))
-    return verify(problem, trajectory, settings)
-
-
-def check_motion(what: str, motion: Any, kinds: tuple[type, ...]) -> None:
-    """Raise InputError, naming `what`, unless `motion` is an instance of `kinds` with arrays of numbers."""
-    descriptions = {Path: "a Path, e.g. result.path", Trajectory: "a Trajectory, e.g. result.trajectory"}
-    check_type(what, motion, kinds, ", or ".join(descriptions[kind] for kind in kinds))
-    check_type(f"{what}.joint_names", motion.joint_names, (tuple, list), "a tuple of names")
+    wanted = "a Path, e.g. result.path, or a Trajectory, e.g. result.trajectory"
+    check_type("motion", motion, (Path, Trajectory), wanted)
+    check_type("motion.joint_names", motion.joint_names, (tuple, list), "a tuple of names")
     for name in array_names(motion):
         values = getattr(motion, name)
         if not isinstance(values, ndarray) or values.dtype.kind not in "iuf":
-            raise InputError(f"{what}.{name} is {shown(values)}; it must be a NumPy array of numbers")
+            raise InputError(f"motion.{name} is {shown(values)}; it must be a NumPy array of numbers")
+    validator = verifier(problem, settings)
+    return validator.trajectory(motion) if isinstance(motion, Trajectory) else validator.path(motion)
 
 
 class Verifier:
@@ -277,14 +260,20 @@ class Verifier:
     def path(self, path: Path) -> Report:
         """See `verify`."""
         self._check_shape("path", path)
-        known_violations: list[Violation | None] = []
+        known_violations = list[Violation | None]()
         if self.dynamics is not None and within(path.positions):
             clock = np.arange(len(path.positions), dtype=float)
             known_violations = [self._torques(clock, static_pieces(path.positions), " to hold the payload")]
         return self._report(path.positions, None, known_violations)
 
     def trajectory(self, trajectory: Trajectory) -> Report:
-        """See `verify_trajectory`."""
+        """Validate a trajectory with its rates and times, and among moving obstacles.
+
+        All limits must hold along the cubics through the positions and velocities of the rows. Velocities and
+        accelerations must agree with the positions. The motion must begin at rest, or with the problem's
+        start velocity, and end at rest. Raises InputError if the joints are not those of the robot, or for
+        wrong shapes.
+        """
         self._check_shape("trajectory", trajectory)
         violation = _unusable(trajectory)
         if violation is not None:
@@ -651,9 +640,7 @@ def collision_violation(contact: Contact, clock: ndarray) -> Violation:
     return Violation(kind, _time_at(at, clock), message, link, partner, depth)
 
 
-def violations(
-    problem: Problem, motion: Path | Trajectory, settings: VerifySettings = DEFAULT
-) -> tuple[Violation, ...]:
+def violations(problem: Problem, motion: Path | Trajectory) -> tuple[Violation, ...]:
     """The violations of a motion in the order of their places; empty if it is valid.
 
     Every contact with static obstacles and between links is listed, at the place where it begins; if a link
@@ -664,7 +651,7 @@ def violations(
     speeds of a trajectory are checked only if the rates are right. If numbers are not finite, or times are
     not those of a motion, only this is returned.
     """
-    report = verify(problem, motion, settings)
+    report = verify(problem, motion)
     if report.valid:
         return ()
     if report.violation.kind in ("not_finite", "time"):
@@ -680,8 +667,8 @@ def violations(
     if isinstance(motion, Trajectory):
         cubics = Cubics(motion)
         wrong_rates = any(wrong.kind in RATE_KINDS for wrong in all_violations)
-        clock, q = (motion.times, q) if wrong_rates else cubics.sampled(settings.chord)[:2]
-    for contact in contacts(problem.robot, problem.scene, q, settings.contact):
+        clock, q = (motion.times, q) if wrong_rates else cubics.sampled(DEFAULT.chord)[:2]
+    for contact in contacts(problem.robot, problem.scene, q, DEFAULT.contact):
         all_violations.append(collision_violation(contact, clock))
     # `verify` may use a finer chord, and so find a contact that the search along these lines misses
     listed = {(w.kind, w.subject, w.other) for w in all_violations}
@@ -692,18 +679,16 @@ def violations(
         times, turns = cubics.turns()
         clock = np.concatenate([clock, times])
         q = np.concatenate([q, turns])
-    all_violations += _limit_violations(problem, q, clock, settings)
+    all_violations += _limit_violations(problem, q, clock)
     return tuple(sorted(all_violations, key=lambda wrong: wrong.time))
 
 
-def _limit_violations(
-    problem: Problem, q: ndarray, clock: ndarray, settings: VerifySettings
-) -> list[Violation]:
+def _limit_violations(problem: Problem, q: ndarray, clock: ndarray) -> list[Violation]:
     robot = problem.robot
     limit_violations = []
     beyond = robot.limit_excess(q)
-    for j in np.flatnonzero((beyond > settings.limit_slack).any(axis=0)).tolist():
-        over = np.flatnonzero(beyond[:, j] > settings.limit_slack)
+    for j in np.flatnonzero((beyond > DEFAULT.limit_slack).any(axis=0)).tolist():
+        over = np.flatnonzero(beyond[:, j] > DEFAULT.limit_slack)
         i = int(over[clock[over].argmin()])
         excess = float(beyond[:, j].max())
         name = robot.joint_names[j]

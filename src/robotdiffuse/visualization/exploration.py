@@ -90,7 +90,7 @@ class Moment:
 
 
 def shares(known: RecordedView) -> Facts:
-    """Labels and values of the fractions of the map that were seen free, and unknown."""
+    """Labels and values of two fractions of the map: seen free, and unknown."""
     parts = (("seen free", known.free), ("unknown", known.unknown))
     return [(name, f"{100 * voxels.mean():.0f} %") for name, voxels in parts]
 

@@ -13,7 +13,7 @@ from robotdiffuse.datasets.shards import write_manifest, write_shard
 from robotdiffuse.learning.checkpoint import save_network
 from robotdiffuse.learning.encoders.networks import PointAutoencoder
 from robotdiffuse.learning.training import tasks as training
-from robotdiffuse.scenes.scene_arrays import SPHERE
+from robotdiffuse.scenes.packed_scenes import SPHERE
 
 
 @pytest.fixture

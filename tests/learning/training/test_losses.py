@@ -8,8 +8,8 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.training import losses
 from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
 from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.packed_scenes import PackedScenes
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box
 
 PANDA = load_robot("panda")

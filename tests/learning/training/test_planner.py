@@ -32,7 +32,7 @@ from robotdiffuse.learning.training.loop import Processes, TrainingRun
 from robotdiffuse.learning.training.losses import LossSettings
 from robotdiffuse.learning.training.tasks import train_encoder, train_planner
 from robotdiffuse.learning.weight_files import RobotIdentity
-from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.packed_scenes import PackedScenes
 from robotdiffuse.scenes.surface_points import sample_surface
 
 SMALL_DENOISER = TransformerSettings(width=32, layers=2, heads=2, hidden=48, patch=8)

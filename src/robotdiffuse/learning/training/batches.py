@@ -26,7 +26,7 @@ from robotdiffuse.learning.encoders.networks import Encoder
 from robotdiffuse.learning.motion_model import PackedClearanceFn
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene_arrays import BOX, NONE, SPHERE, PackedScenes
+from robotdiffuse.scenes.packed_scenes import BOX, NONE, SPHERE, PackedScenes
 
 Trajectories = Float[ndarray, "n waypoints dof"]
 

@@ -17,7 +17,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Count, NotNegative, Settings, Share
 from robotdiffuse.core.transforms import placed, rotation_from_quaternion
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
+from robotdiffuse.scenes.packed_scenes import BOX, SPHERE, PackedScenes
 from robotdiffuse.scenes.shapes import Mesh
 from robotdiffuse.scenes.surface_points import draw
 

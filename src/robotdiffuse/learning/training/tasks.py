@@ -59,7 +59,7 @@ from robotdiffuse.learning.training.losses import (
 from robotdiffuse.learning.weight_files import NETWORKS, RobotIdentity
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.packed_scenes import PackedScenes
 
 STANDARDIZATION_SCENES = 2048
 """Number of scenes over which the components of the embedding z are standardized."""

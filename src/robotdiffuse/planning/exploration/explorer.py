@@ -434,15 +434,14 @@ class Explorer:
         if may_look and policy == STRICT:  # a short search; a view may show more free space
             quick = min(QUICK_FRACTION * limit * 2**self._views_taken, limit)
         motion = self._motion(problem, policy, predicted, quick, may_look)
-        if self._may_go(motion, policy):
-            return self._go(motion, policy)
+        go = self._go(motion, policy)
+        if go is not None:
+            return go
         look = self._look(problem, policy, predicted, motion)
         skipped = may_look and policy == STRICT and motion.status is Status.NO_PATH
         # if no view can be taken, search for the whole time limit, even if too little was seen free
         if look.kind == STUCK and (quick < limit or skipped):
-            motion = self._motion(problem, policy, predicted, limit)
-            if self._may_go(motion, policy):
-                return self._go(motion, policy)
+            return self._go(self._motion(problem, policy, predicted, limit), policy) or look
         return look
 
     def _keeps(self, motion: PlanResult, policy: str) -> bool:
@@ -450,10 +449,11 @@ class Explorer:
             return motion.solved
         return motion.confidence is not None and motion.confidence >= self.settings.confidence
 
-    def _may_go(self, motion: PlanResult, policy: str) -> bool:
-        return self._keeps(motion, policy) and not self._goal_seen.missing(motion)
-
-    def _go(self, motion: PlanResult, policy: str) -> Step:
+    def _go(self, motion: PlanResult, policy: str) -> Step | None:
+        """The step that executes a motion; None if the motion does not keep to the policy, or if its goal
+        must be seen first."""
+        if not self._keeps(motion, policy) or self._goal_seen.missing(motion):
+            return None
         stated = motion.confidence  # None for strict motions
         free = "that stays in space seen free"
         if stated is not None:
@@ -497,8 +497,9 @@ class Explorer:
         elif not to_view.any():
             safe_motion = self._within_seen_free(problem, tentative.path.positions, "as seen")
             safe_policy = STRICT
-        if safe_motion is not None and self._may_go(safe_motion, safe_policy):
-            return self._go(safe_motion, safe_policy)
+        go = None if safe_motion is None else self._go(safe_motion, safe_policy)
+        if go is not None:
+            return go
         predicted = self.predicted() if predicted is None else predicted
         # The motion to a viewpoint is through space seen free if possible, under all policies. With
         # strict_then_probabilistic, the strict policy has tried this before the probabilistic one.

@@ -27,7 +27,7 @@ from robotdiffuse.planning.exploration.explorer import Explorer
 from robotdiffuse.planning.exploration.steps import LOOK, ArmCamera, ExplorerSettings, Step
 from robotdiffuse.problems.problem import Problem, is_given
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.validation.validator import verify, verify_trajectory
+from robotdiffuse.validation.validator import verify
 
 
 @frozen_dataclass
@@ -241,15 +241,12 @@ def explore(
     explorer: Explorer,
     noise: DepthNoise | None = None,
     seed: int = 0,
-    fixed_view: DepthView | None = None,
 ) -> Iterator[Event]:
     """Explore the problem's scene from its start to its goal, and yield each step. Ends with a step without a
     motion, or after a motion that the validator refuses in the true scene.
 
-    The cameras on the arm take images during each motion.
-
-    fixed_view: an image of a fixed camera. This camera takes another image after each motion, because the arm
-        then hides another part of the scene.
+    The cameras on the arm take images during each motion. Images of other cameras may be observed after each
+    step.
     """
     rng = np.random.default_rng(seed)
     q = problem.start
@@ -266,16 +263,11 @@ def explore(
         true_problem = Problem(problem.robot, problem.scene, planned_problem.start, planned_problem.goal)
         violation = verify(true_problem, path).violation
         if violation is None:
-            violation = verify_trajectory(true_problem, step.motion.trajectory).violation
+            violation = verify(true_problem, step.motion.trajectory).violation
         for camera in explorer.cameras:
             for at in _image_configurations(step.motion):
                 explorer.observe(taken(problem, camera, at, noise, rng))
         q = path.positions[-1]
-        if fixed_view is not None:
-            height, width = fixed_view.depth.shape
-            fixed_camera = fixed_view.T_base_camera, fixed_view.intrinsics, (width, height)
-            view = ray_cast(problem.scene, *fixed_camera, problem.robot, q)
-            explorer.observe(measured(view, np.inf, noise, rng))
         yield Event(step, q, "" if violation is None else violation.message)
         if violation is not None:
             return

@@ -432,7 +432,7 @@ class SharedTreeRRTStar(Planner[SharedTreeSettings]):
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        for settings, attempt in ever_finer(context, self.settings):
+        for attempt, settings in enumerate(ever_finer(context, self.settings)):
             state = random_state(context.request.seed, attempt)
             search = SharedTreeSearch(start_goal.checker, *start_goal.leads(), settings, state)
 

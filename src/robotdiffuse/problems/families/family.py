@@ -74,7 +74,7 @@ class SampledProblem:
     """Target pose of the tip. If the target is only a position, the first goal gives the orientation."""
 
     def problem(self, robot: Robot) -> Problem:
-        """Make the problem of reaching any of the goals, or a configuration whole turns of joints away.
+        """Make the problem of reaching any of the goals; joints may end whole turns away from it.
 
         Args:
             robot: The robot for which the problem was drawn.

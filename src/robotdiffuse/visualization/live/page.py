@@ -24,7 +24,7 @@ from robotdiffuse.planning import PLANNERS
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
-from robotdiffuse.validation.validator import verify_trajectory
+from robotdiffuse.validation.validator import verify
 from robotdiffuse.visualization.live.server import PageServer
 from robotdiffuse.visualization.live.session import (
     COLLISIONS,
@@ -384,7 +384,7 @@ class Panel:
         if state.motion is None:
             raise InputError("there is no motion to save yet")
         # the problem may have changed since the motion was planned
-        report = verify_trajectory(state.problem, state.motion.trajectory)
+        report = verify(state.problem, state.motion.trajectory)
         if report.violation is not None:
             raise InputError(f"the motion is not valid any more: {report.violation.message}")
         return result_page(state.problem, replace(state.motion, min_clearance=report.min_clearance)).encode()

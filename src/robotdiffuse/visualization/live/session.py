@@ -35,7 +35,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere, Triangulated
 from robotdiffuse.validation.report import Report
-from robotdiffuse.validation.validator import verify_trajectory
+from robotdiffuse.validation.validator import verify
 
 NEW_OBSTACLES: dict[str, Callable[[Vector, float], Shape]] = {
     "sphere": lambda center, size: Sphere(center, size),
@@ -375,7 +375,7 @@ def _posed(goal: Goal, frame: str, T_base_frame: Pose) -> PoseGoal | PosesGoal:
 
 def _validated(problem: Problem, motion: PlanResult, version: int) -> Validation:
     began = time.perf_counter()
-    report = verify_trajectory(problem, motion.trajectory)
+    report = verify(problem, motion.trajectory)
     return Validation(version, report, time.perf_counter() - began)
 
 

@@ -11,7 +11,7 @@ from robotdiffuse.core.transforms import rotation_from_quaternion
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.training.batches import random_scenes
 from robotdiffuse.problems.families.rop import ROP_DENSE
-from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
+from robotdiffuse.scenes.packed_scenes import BOX, SPHERE, PackedScenes
 from robotdiffuse.scenes.surface_points import PANDA_REGION
 
 
