@@ -49,7 +49,7 @@ def run_explore(arguments: Namespace) -> int:
             raise InputError("--live writes no files; leave out --out, --view and --record")
         from robotdiffuse.cli.live import show_live
 
-        show_live(arguments, settings)  # ends with the process
+        show_live(arguments, settings)  # does not return
     elif (arguments.speed, arguments.host, arguments.port) != (1.0, LOOPBACK, PORT):
         raise InputError("--speed, --host and --port say how --live is served; add --live")
     problem = load_problem(arguments.problem)

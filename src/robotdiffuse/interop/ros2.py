@@ -479,7 +479,7 @@ def write_bag(problem: Problem, trajectory: Trajectory, file: Path) -> None:
         "/display_planned_path": (DISPLAY_TRAJECTORY, display_trajectory(problem, trajectory, record)),
     }
     try:
-        # the writer names the database after `new`, which is named as `file`
+        # the writer names the database after `new`, which has the same name as `file`
         with replaced_folder(file) as new, BagWriter(new, version=VERSION) as writer:
             for topic, (kind, content) in topics.items():
                 connection = writer.add_connection(topic, kind, typestore=typestore())

@@ -165,7 +165,7 @@ class KinematicTree(Value):
 
     @property
     def T_base_root(self) -> Pose | None:
-        """Pose of the URDF's root in the base frame; None if a movable joint lies between base and root."""
+        """Pose of the link `root` in the base frame; None if a movable joint lies between base and root."""
         return np.eye(4) if self.root in ("", self.base) else self.above.get(self.root)
 
     @cached_property

@@ -353,9 +353,9 @@ def fastest_speeds(first, second, grid, velocity, lowest, highest, start_speed=0
         speeds[i] = np.sqrt(x)
         width = grid[i + 1] - grid[i]
         high, slope = _bounds_of_next(first, second, i, width, x, max_x[i + 1], lowest, highest)[2:4]
-        # Rounding errors must not stop the motion. From max_x[i], the backward pass made a next x possible of
-        # MIN_SPEED_RATIO times the smaller one of max_x[i] and max_x[i + 1]; from a smaller x, x / max_x[i]
-        # times that next x is possible.
+        # Rounding errors must not stop the motion. The backward pass ensures that from max_x[i], a next x of
+        # MIN_SPEED_RATIO times the smaller of max_x[i] and max_x[i + 1] is possible; from a smaller x,
+        # x / max_x[i] times that next x is possible.
         min_next = MIN_SPEED_RATIO * x * min(1.0, max_x[i + 1] / max_x[i])
         x = min(max(high + slope * x, min_next), max_x[i + 1])
     return speeds

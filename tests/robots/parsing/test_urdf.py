@@ -378,7 +378,7 @@ def test_meshes_by_package_relative_and_scaled(tmp_path: Path) -> None:
         ("", "link arm: a <collision> has 0 shapes"),
         ('<box size="1 1 1"/><sphere radius="3"/>', "link arm: a <collision> has 2 shapes"),
         ('<torus size="1"/>', "shape <torus> is not supported; known: box, capsule, cylinder, mesh, sphere"),
-        ('<cylinder radius="0" length="1"/>', "link arm: cylinder radius is '0'; it must be above 1e-9"),
+        ('<cylinder radius="0" length="1"/>', "link arm: cylinder radius is '0'; it must be at least 1e-9"),
         ('<mesh filename="a.stl" scale="1 0 1"/>', "link arm: mesh scale is '1 0 1'; numbers must be beyond"),
     ],
 )

@@ -246,8 +246,8 @@ def predicted_obstacles(problem: Problem) -> AssumedPoints:
 
 
 def _goals(context: PlanningContext, as_seen: Problem) -> Configurations | PlanResult:
-    """The goal configurations: the only one of a JointGoal, or those that reach the goal and are free of
-    observed obstacles. A failed result if there are none."""
+    """The goal configurations: that of a JointGoal with only one, else those that reach the goal and are
+    free of observed obstacles. A failed result if there are none."""
     if isinstance(as_seen.goal, JointGoal) and len(as_seen.goal.positions) == 1:
         return as_seen.goal.positions
     start_goal = usable_start_goal(PlanningContext(context.planner_name, as_seen, context.request))
@@ -275,8 +275,8 @@ class _Attempts:
     context: PlanningContext
     unknown: UnknownSpace
     max_confidence: float
-    """Upper limit of the confidence, lowered if a camera seems misplaced, since its images may then show
-    occupied space as free, and if the arm reaches farther than the network predicts."""
+    """Upper limit of the confidence, lowered if the arm reaches farther than the network predicts, or if a
+    camera seems misplaced, since its images may then show occupied space as free."""
 
     def best(self, problem: Problem, assumption: str, end: float) -> PlanResult:
         """A motion that is found before `end` [s since the call], or the result that says why there is none.

@@ -588,7 +588,7 @@ class UrdfTree:
             values = self._numbers(shape.get(name, ""), count, location)
             if (values < MIN_SIZE).any():
                 raise InputError(
-                    f"{self.path}: {location} is {shown(shape.get(name))}; it must be above 1e-9"
+                    f"{self.path}: {location} is {shown(shape.get(name))}; it must be at least 1e-9"
                 )
             return values
 
@@ -664,8 +664,8 @@ def _attributes(element: ET.Element, tag: str) -> dict[str, str]:
     return {} if child is None else child.attrib
 
 
-# FIELDS: fields of joint_limits.yaml of MoveIt and ros2_control, and those of `Joint`. FACTORS: MoveIt's
-# fields that are ignored with a note.
+# FIELDS: fields of joint_limits.yaml of MoveIt and ros2_control, and those of `Joint`. FACTORS: ignored
+# fields of MoveIt for which the note names an argument of `plan`.
 FIELDS = {
     "min_position": "lower",
     "max_position": "upper",
