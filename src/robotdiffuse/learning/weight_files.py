@@ -263,9 +263,9 @@ def check_weights(name: str, folder: str | Path | None) -> None:
 
 def weights_folder(name: str, folder: str | Path | None, robot: Robot) -> Path:
     """The folder with weights of a network: the given folder, the folder from `weights_for`, or the bundled
-    one of another arm with the robot's name.
+    one of the robot's name, even though it is for another arm.
 
-    Raises InputError if it holds no such weights, naming the command that trains them.
+    Raises InputError if there are no such weights, naming the command that trains them.
     """
     check_weights(name, folder)
     if folder is not None:

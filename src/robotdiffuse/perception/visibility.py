@@ -157,8 +157,8 @@ def see_through(depth, intrinsics, T, balls, radius, errors, border, seen):
     the distance. border: width of the margin around the projection that is checked as well [pixels]. seen:
     bool[n]. All numbers are float32.
     """
-    raw = usable_depth(depth, intrinsics[0])
-    h, w = raw.shape
+    usable = usable_depth(depth, intrinsics[0])
+    h, w = usable.shape
     fx, fy, cx, cy = intrinsics
     for n in range(len(balls)):
         if seen[n]:
@@ -180,7 +180,7 @@ def see_through(depth, intrinsics, T, balls, radius, errors, border, seen):
             continue
         # at most MAX_DEPTH / 2: pixels with nothing in range have the depth MAX_DEPTH, behind every ball
         min_return = min(far + errors[2] * far * far, MAX_DEPTH * _HALF)
-        seen[n] = _all_behind(raw, int(v0), int(v1), int(u0), int(u1), min_return)
+        seen[n] = _all_behind(usable, int(v0), int(v1), int(u0), int(u1), min_return)
 
 
 @kernel(nogil=True)

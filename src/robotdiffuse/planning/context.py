@@ -398,7 +398,7 @@ class PlanningContext:
                 self._ended = Status.NO_PATH, timed.violation.message
             return self._refuse(timed.violation, trajectory.duration)
         # Progress ends with the returned path, at the time when the search recorded its length. Shorter
-        # recorded paths are left out, since they were refused.
+        # recorded paths are left out: they were refused, or a longer path gives a faster motion.
         tolerance = path.length * 1e-3
         longer = [(at, length) for at, length in self._progress if length > path.length + tolerance]
         times = [at for at, length in self._progress if abs(length - path.length) <= tolerance]

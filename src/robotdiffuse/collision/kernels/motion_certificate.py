@@ -88,8 +88,8 @@ class Checks(NamedTuple):
     """[checks, dof] bound on the motion of any point of the link, or of either link of a pair, per unit of
     joint motion, relative to `common`."""
     surfaces_below: np.ndarray
-    """[checks] for grazing links, distance of the convex parts up to which Coal measures their mesh surfaces
-    [m]; else 0."""
+    """[checks] for grazing links (`Robot.grazing`), distance between their convex parts up to which Coal
+    measures their mesh surfaces [m]; else 0."""
 
 
 class Round(NamedTuple):

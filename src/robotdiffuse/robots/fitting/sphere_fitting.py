@@ -54,7 +54,7 @@ TIGHT_SLOPE = 0.3
 MIN_DEPTH = 5e-4
 """Lower bound on the inscribed radius of a link, for thin plates [m]."""
 FLOOR_TOLERANCE = 0.0015
-"""Spheres may always stick out this far towards the floor [m], since a link may lie on it."""
+"""Lower bound of the tolerance near the floor [m]; not zero, since a link may lie on the floor."""
 TOLERANCE_LEVEL = np.log(1.3)
 """Tight places with similar tolerances form a group, which saves time: the tolerances of a group differ by at
 most a factor of 1.3 (here its logarithm), and the lowest one applies to all of its places."""

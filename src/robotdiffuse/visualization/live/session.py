@@ -114,7 +114,7 @@ class State:
     failure: str = ""
     """Why the planner could not run, in one line; empty if it could."""
     motion: PlanResult | None = None
-    """The result whose motion is shown. A motion for an outdated version is shown only if it is free."""
+    """The result whose motion is shown. A new one for an outdated version is shown only if it is free."""
     validation: Validation | None = None
     """Validation of the shown motion. Until the validation for this version is complete, it is one of an
     earlier version."""
