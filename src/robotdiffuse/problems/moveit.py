@@ -274,8 +274,8 @@ def moveit_scene(
     allowed = matrix_contacts(mapping_of(SCENE, data, MATRIX), names, links)
     scene = Scene(shapes, allowed)
     additional = Scene(shapes, contacts).allowed_contacts  # type: ignore[arg-type]
-    # Both name the shapes by their unique names, which the scene here must have too: a unique name may be the
-    # name that another one of `shapes` was given.
+    # Both use the unique names that `Scene` gave the shapes, so take `scene.shapes`: in `shapes`, the unique
+    # name of one shape may be the original name of another.
     return Scene(scene.shapes, (*scene.allowed_contacts, *additional))
 
 
