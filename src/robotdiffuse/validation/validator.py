@@ -13,6 +13,7 @@ the values in between. If such a bound exceeds the limit, the piece is halved.
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
+from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -387,8 +388,8 @@ class Verifier:
             self._twitch(q, clock),
             self._constrained(q, clock, along),
         )
-        found = [violation for violation in every if violation is not None]
-        first = min(found, key=lambda violation: violation.time, default=None)
+        found = [*filter(None, every)]
+        first = min(found, key=attrgetter("time"), default=None)
         last = len(q) - 1 if first is None else int(np.searchsorted(clock, first.time))
         sweep = self._continuous.sweep(q[: last + 1])
         scene = sweep.scene_clearance
@@ -401,8 +402,8 @@ class Verifier:
             if moving.contact is not None:
                 candidates.append(_moving_contact_violation(moving.contact))
         candidates += [self._waypoints(q, clock, at_rest), self._goal(q[-1], float(clock[-1]))]
-        earliest = [v for v in candidates if v is not None]
-        violation = min(earliest, key=lambda v: v.time, default=None)
+        earliest = [*filter(None, candidates)]
+        violation = min(earliest, key=attrgetter("time"), default=None)
         every_violation = tuple(dict.fromkeys((*found, *earliest)))
         clearances = (scene, sweep.self_clearance) if violation is None else (None, None)
         return Report(violation is None, violation, *clearances, found=every_violation)
@@ -680,7 +681,7 @@ def violations(problem: Problem, motion: Path | Trajectory) -> tuple[Violation, 
         clock = np.concatenate([clock, times])
         q = np.concatenate([q, turns])
     all_violations += _limit_violations(problem, q, clock)
-    return tuple(sorted(all_violations, key=lambda wrong: wrong.time))
+    return tuple(sorted(all_violations, key=attrgetter("time")))
 
 
 def _limit_violations(problem: Problem, q: ndarray, clock: ndarray) -> list[Violation]:
