@@ -509,7 +509,7 @@ class Noisy(NamedTuple):
     """An intermediate state of denoising."""
 
     level: float
-    """Noise level as a fraction of T; 0 for the finished motion."""
+    """Noise level as a fraction of the largest level; 0 for the finished motion."""
     path: Path
 
 

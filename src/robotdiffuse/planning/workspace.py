@@ -55,7 +55,7 @@ from whole turns of continuous joints."""
 
 
 def _kept(value: Any) -> Any:
-    """The value with copies of its arrays, lists and tables, which do not change with what was given."""
+    """A copy of the value: its arrays, lists and dicts do not change if those of the caller do."""
     if isinstance(value, list):
         return [_kept(entry) for entry in value]
     if isinstance(value, dict):
@@ -65,7 +65,7 @@ def _kept(value: Any) -> Any:
 
 
 class _OwnValues:
-    """Base of steps: their fields do not change with what was given."""
+    """Base of steps: their fields do not change if the caller changes the values that it gave."""
 
     def __post_init__(self) -> None:
         self.__dict__.update(_kept(vars(self)))

@@ -48,7 +48,7 @@ class PyBulletOracle(World):
         self.place(configurations(self.robot, q))
         candidates = [
             (link, name, body, -1)
-            for link in self.moving
+            for link in self.moving_links
             for name, body in self.obstacles.items()
             if not self.scene.may_touch(link, name)
         ]

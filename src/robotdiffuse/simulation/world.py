@@ -118,7 +118,7 @@ class World:
         }
         """Values of the joints that planning does not move, by PyBullet's index."""
         solid = [link for link in robot.link_names if robot.meshes.get(link)]
-        self.moving = [link for link in solid if robot.link_frame(link) > 0]
+        self.moving_links = [link for link in solid if robot.link_frame(link) > 0]
         """Links with geometry that a planned joint moves."""
         self.pairs = pairs_to_check(robot, solid)
         """Pairs of links that are checked against each other."""
@@ -354,8 +354,8 @@ class ReplayContact:
     depth: float
     """Largest penetration depth [m]; negative if a gap remained.
 
-    Bullet pushes two links apart from a distance of 2 mm, and a link and an obstacle from 1 mm, so bodies may
-    be pushed apart before they touch.
+    Bullet pushes two links apart if they are nearer than 2 mm, a link and an obstacle if nearer than 1 mm. So
+    bodies may be pushed apart before they touch.
     """
 
 
