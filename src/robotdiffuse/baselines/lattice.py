@@ -100,7 +100,7 @@ def _distance(s, u, v):
 def _update_vertex(s, v):
     """UpdateVertex of D* Lite: sets the key of a node in the queue. The heuristic is the larger of two lower
     bounds on the cost to the start: the Euclidean distance, and the summed joint differences divided by
-    sqrt(k), where k is the most joints that a move has. Such a move covers k of this sum for sqrt(k)."""
+    sqrt(k), where k is the most joints that a move has. Such a move, of cost sqrt(k), lowers the sum by k."""
     node = s.nodes[v]
     queue = s.queue
     i = len(queue) // 2 + v

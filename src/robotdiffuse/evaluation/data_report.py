@@ -34,8 +34,8 @@ QUANTITIES = {
 SPREAD = {"least": 0.0, "5 %": 0.05, "median": 0.5, "95 %": 0.95, "most": 1.0}
 """Quantiles of each quantity over the motions."""
 SAMPLED_MOTIONS = 20_000
-"""ARRAYS_OF_SAMPLE are read for every k-th motion only. k is the largest number for which at least this
-number of motions of a complete data set is read; of a smaller data set, all motions are read."""
+"""ARRAYS_OF_SAMPLE are read for every k-th motion only, with the largest k that gives at least this many
+motions of a complete data set. If the data set has fewer motions, all are read."""
 SAMPLED_WAYPOINTS = 24
 """Number of waypoints that are read of each of these motions, spread evenly."""
 ARRAYS_OF_ALL = ("cost", "clearance", "end_clearance", "safety_distance", "line_free", "detour", "family")

@@ -36,7 +36,7 @@ from robotdiffuse.core.types import Configuration, Points, Pose, Value, frozen_d
 from robotdiffuse.scenes.shapes import PointCloud
 
 INTEGER_NO_RETURN = 65535
-"""Integer depths of this value, the largest of 16 bits, mean "no return", in images of any type."""
+"""Integer depths of this value, the largest of 16 bits, mean "no return", in images of any integer type."""
 MIN_FOCAL_LENGTH = 1e-3
 """Minimum focal length [pixels]: smaller values underflow in float32, or are meaningless."""
 NEAREST = 0.05
@@ -294,7 +294,7 @@ class DepthNoise(Settings, name="depth_noise"):
         depth = view.depth.astype(np.float64)
         lost = self._grazed(view)  # pixels that will have no return
         for axis in (0, 1):
-            # of two neighbors with an edge between them, the first becomes a flying pixel
+            # of two neighbors with an edge between them, only the first may become a flying pixel
             neighbor = clean.take(np.arange(1, clean.shape[axis] + 1), axis, mode="clip")
             both = np.isfinite(clean) & np.isfinite(neighbor)
             step = np.where(both, neighbor, 0.0) - np.where(both, clean, 0.0)

@@ -300,7 +300,7 @@ def _requested(
             continue
         start_value = request.start.get(joint.name, locked)
         if abs(locked - start_value) > MIMIC_SLACK:
-            why = f"mimics {joint.mimic.joint}:" if joint.mimic else "is"
+            why = f"mimics {joint.mimic.joint} and is" if joint.mimic else "is"
             notes.append(f"start_state: {joint.name} is {start_value:g}, but it {why} held at {locked:g}")
 
     for i, values in enumerate(request.joint_goals):

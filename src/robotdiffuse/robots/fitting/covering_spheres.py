@@ -100,8 +100,8 @@ def _outermost(points: Points, axis: int) -> Points:
 
 
 def _around(points: Points) -> Float[ndarray, "4"]:
-    """A small sphere around points. Centers are tried from the center of the points' box on, by Badoiu and
-    Clarkson's algorithm; the smallest sphere found is returned."""
+    """A small sphere around points. Badoiu and Clarkson's algorithm moves the center, beginning at the center
+    of the points' box; the smallest sphere found is returned."""
     center, _ = ball_around(points)
     best = np.array([*center, np.inf])
     for i in range(1, BOUNDING_STEPS):

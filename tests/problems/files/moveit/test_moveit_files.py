@@ -267,7 +267,7 @@ def test_a_mimic_joint_elsewhere_than_its_master_puts_it_is_a_note(tmp_path: Pat
     (tmp_path / "scene0001.yaml").write_text("{}")
     (tmp_path / "request0001.yaml").write_text(yaml.safe_dump({"start_state": here, "goal_constraints": [goal]}))
     [entry] = load_motion_bench_maker(tmp_path, robot)
-    assert entry.load().notes == ("start_state: follow is 0.01, but it mimics grip: held at 0.03",)
+    assert entry.load().notes == ("start_state: follow is 0.01, but it mimics grip and is held at 0.03",)
 
 
 def pose_constraint() -> dict[str, Any]:
