@@ -322,7 +322,7 @@ BENCH = Command(
                 ("folder FOLDER", "folder of `robotdiffuse bench run`"),
                 (
                     "--limits S,...",
-                    "time limits [s] (default: those of the run, and those of 0.1, 1, 10, 60 below them)",
+                    "time limits [s] (default: the run's, and those of 0.1, 1, 10, 60 below its longest)",
                     positives,
                 ),
                 ("--planners NAME,...", "planners to include (default: all)", names),

@@ -149,7 +149,7 @@ class PlannerProcess:
     def __init__(self, spec: PlannerSpec, log: Path, cpu_time: bool = False) -> None:
         """The output of the process is appended to the file `log`. For `cpu_time` see `BenchSettings`.
 
-        Raises InputError if this file cannot be written: its process would end, which would count as a crash.
+        Raises InputError if this file cannot be written: the process would end, which would count as a crash.
         """
         with writing(log):
             log.parent.mkdir(parents=True, exist_ok=True)

@@ -143,7 +143,7 @@ class Diffusion(ExportedPlanner[DiffusionSettings]):
                 until = context.elapsed + self.settings.optimize_time
             samples = samples + paths
             valid = valid + passed
-            if valid:  # a further batch must leave time to time the best path
+            if valid:  # a further batch must leave time for timing the best path
                 until = min(until, context.search_until - (context.elapsed - began))
         reason = f"{len(valid)} of {len(samples)} samples of the network are valid"
         # If no sample is valid, the last one is validated again, so that the result names its violation.
