@@ -110,7 +110,9 @@ def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
     Jumps of continuous joints by whole turns are removed. The recording may contain other joints of the
     robot, if these stay at their locked values. Missing velocities are those of the cubic spline through the
     rows that starts and ends at rest. A missing acceleration is the mean of the accelerations of the two
-    cubics that meet at its row. Raises InputError for missing or unknown joints, and for other joints that leave their locked values.
+    cubics that meet at its row.
+
+    Raises InputError for missing or unknown joints, and for other joints that leave their locked values.
     """
     notes = list(motion.notes)
     columns = {name: j for j, name in enumerate(motion.joint_names)}
