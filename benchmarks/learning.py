@@ -35,10 +35,10 @@ from robotdiffuse.core.tables import Cell, Column, Table, show
 from robotdiffuse.evaluation.bench_comparisons import bootstrap_interval, wilson_interval
 from robotdiffuse.evaluation.runs import (
     NETWORK_ALONE,
-    Clock,
     Draw,
     Record,
     Run,
+    clocked,
     from_control,
     from_network,
     run_all,
@@ -177,9 +177,9 @@ def equal_time_steps(planner: Diffusion, cases: list[Case]) -> int:
     for turn in seconds:  # the first is left out: it loads and compiles
         for i, case in enumerate(cases):
             for j, draw in enumerate(draws):
-                with Clock() as clock:
+                with clocked() as took:
                     draw(Run(case, i, "", 1), CollisionChecker(PANDA, case.problem.scene))
-                turn[i, j] = clock.cpu
+                turn[i, j] = took["cpu"]
     network, short, long = np.median(seconds[1:], axis=0).mean(axis=0)
     return max(round(few + (network - short) * (many - few) / (long - short)), 1)
 

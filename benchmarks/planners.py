@@ -38,7 +38,7 @@ from common import (
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.types import LENGTH
 from robotdiffuse.core.types import Path as JointPath
-from robotdiffuse.evaluation.runs import Clock, Record, gather_cases, planned, run_all
+from robotdiffuse.evaluation.runs import Record, clocked, gather_cases, planned, run_all
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.families import FAMILIES, load_family
@@ -157,9 +157,9 @@ def limits(cases: Sequence[Case]) -> None:
     for limit in OVERRUN_LIMITS:
         over = []
         for case in progress(cases, f"{limit:g} s"):
-            with Clock() as clock:
+            with clocked() as seconds:
                 result = planner.plan(case.problem, limit, until=TIME_LIMIT, clearance=0.0, objective=LENGTH)
-            over.append((1e3 * (clock.wall - limit), result.solved))
+            over.append((1e3 * (seconds["time"] - limit), result.solved))
         late = np.array([o for o, _ in over])
         solved = sum(s for _, s in over)
         p50, p99 = np.percentile(late, (50, 99))
@@ -185,9 +185,9 @@ def timing(cases: Sequence[Case], count: int = TIMED_PATHS) -> None:
                 paths.append(result.path)
     always: Callable[[object], bool] = lambda _: True  # noqa: E731
     for path in progress([paths[i] for i in rng.permutation(len(paths))[:count]], "timing"):
-        with Clock() as clock:
+        with clocked() as seconds:
             time_parameterize(PANDA, path, always, always, TimingSettings())
-        times.append(1e3 * clock.cpu)
+        times.append(1e3 * seconds["cpu"])
         fine = time_parameterize(PANDA, path, always, always, TimingSettings(sample_time=0.001)).trajectory
         worst[0] = max(worst[0], float((np.abs(fine.velocities) / PANDA.velocity).max()))
         worst[1] = max(worst[1], float((np.abs(fine.accelerations) / PANDA.acceleration).max()))

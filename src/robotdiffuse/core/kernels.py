@@ -15,6 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 from numba import njit
 from numba.core import caching, errors, event
 
@@ -35,6 +36,10 @@ if BLAS not in sys.modules:
 errors.ColorShell = nullcontext  # type: ignore[misc]
 
 
+# numbers in single precision, for compiled code
+ZERO = np.float32(0.0)
+HALF = np.float32(0.5)
+ONE = np.float32(1.0)
 # Marks the checksum at the end of a file of compiled code; Numba ignores what follows its own data.
 CHECKSUM = b"crc32"
 PACKAGE = Path(__file__).parents[1]

@@ -3,7 +3,7 @@
 import csv
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from pathlib import Path as FilePath
@@ -131,6 +131,14 @@ UNTIL = (FIRST, CONVERGED, TIME_LIMIT)
 LENGTH = "length"
 TIME = "time"
 OBJECTIVES = (LENGTH, TIME)
+
+
+Done = Callable[[int, int], None]
+"""Called with the number of finished calls, motions or other items, and the number of all."""
+
+
+def unreported(done: int, total: int) -> None:
+    """A `Done` that does nothing."""
 
 
 T = TypeVar("T")

@@ -7,7 +7,7 @@ target's position is our interpretation. Both arrays are float32.
 """
 
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -23,7 +23,7 @@ from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError, check_type, counted, joined, numbers, reading, shown
 from robotdiffuse.core.files import check_output, file_name, input_file, lock_folder, write_atomically
 from robotdiffuse.core.settings import AtLeastTwo, converted
-from robotdiffuse.core.types import Path, Trajectory, step_lengths
+from robotdiffuse.core.types import Done, Path, Trajectory, step_lengths, unreported
 from robotdiffuse.datasets.shards import (
     MANIFEST,
     SPLITS,
@@ -150,7 +150,7 @@ def _write(
     scenes: Sequence[Scene],
     q: Float32[ndarray, "n waypoints dof"],
     about: dict[str, Any],
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Done = unreported,
 ) -> int:
     """Write a data set into an empty folder; returns the number of its motions.
 
@@ -286,7 +286,7 @@ def import_npz(
     folder: str | FilePath,
     robot: str = "panda",
     radius: float = SPHERE_RADIUS,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Done = unreported,
 ) -> int:
     """Make a data set in an empty folder from a robot.npz; returns the number of its motions.
 

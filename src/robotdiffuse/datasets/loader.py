@@ -114,7 +114,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
             why = described(error)
             raise InputError(f"device is {shown(device)}; PyTorch cannot use it: {why}") from None
         self.seed = seed
-        self._generators: dict[int, torch.Generator] = {}
+        self._generators = dict[int, torch.Generator]()
         self.normalizer = JointNormalizer(np.array(self.manifest.lower), np.array(self.manifest.upper))
         middle, half_range = (
             a.astype(np.float32) for a in (self.normalizer.middle, self.normalizer.half_range)
@@ -124,7 +124,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
             torch.from_numpy(np.tile(a, self.waypoints)).to(self.device)
             for a in (1 / half_range, -middle / half_range)
         )
-        self._trajectories: list[ndarray] = []
+        self._trajectories = list[ndarray]()
         places = []
         poses = []
         scenes = []

@@ -307,7 +307,7 @@ def write_shard(folder: str | FilePath, index: int, arrays: Arrays, counts: Coun
         "counts": dict(sorted(counts.items())),
     }
     # first in memory: zarr's threads would write on after the error of a full disk
-    files: dict[str, Any] = {}
+    files = dict[str, Any]()
     group = zarr.open_group(files, mode="w", zarr_format=3, attributes=attributes)
     for name, array in converted.items():
         group.create_array(

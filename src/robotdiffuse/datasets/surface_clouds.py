@@ -10,16 +10,13 @@ from jaxtyping import Float32
 from torch import Generator, Tensor
 
 from robotdiffuse.collision.kernels.frames import write_rotation
-from robotdiffuse.core.kernels import kernel
+from robotdiffuse.core.kernels import HALF, ONE, ZERO, kernel
 from robotdiffuse.scenes.packed_scenes import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.surface_points import VisibleRegion
 
 # Largest number of samples that are drawn for each requested point; samples outside the region are dropped.
 _OVERSAMPLING = 8
-_ZERO = np.float32(0.0)
-_ONE = np.float32(1.0)
 _TWO = np.float32(2.0)
-_HALF = np.float32(0.5)
 _QUARTER = np.float32(0.25)
 _FOUR = np.float32(4.0)
 _PI = np.float32(np.pi)
@@ -86,11 +83,11 @@ def fill_clouds(kinds, params, seeds, region, out):
     faces = np.empty((k, 2), np.float32)
     axes = np.empty((k, 3, 3), np.float32)
     for i in range(n):
-        total = _ZERO
+        total = ZERO
         last = 0
         for j in range(k):
             area = _prepare(kinds[i, j], params[i, j], faces[j], axes[j])
-            if area > _ZERO and _may_intersect(region, params[i, j], axes[j]):
+            if area > ZERO and _may_intersect(region, params[i, j], axes[j]):
                 total += area
                 last = j
             ends[j] = total
@@ -99,7 +96,7 @@ def fill_clouds(kinds, params, seeds, region, out):
             x = _next(x)
         filled = 0
         draws = _OVERSAMPLING * count
-        if total <= _ZERO:
+        if total <= ZERO:
             draws = 0
         for _ in range(draws):
             if filled == count:
@@ -113,25 +110,25 @@ def fill_clouds(kinds, params, seeds, region, out):
             # a point (u, v) of the unit square around 0; for a sphere, of the largest disc in this square
             while True:
                 x = _next(x)
-                u = np.float32(x >> np.uint64(40)) * _UNIT - _HALF
-                v = np.float32((x >> np.uint64(16)) & _MASK) * _UNIT - _HALF
+                u = np.float32(x >> np.uint64(40)) * _UNIT - HALF
+                v = np.float32((x >> np.uint64(16)) & _MASK) * _UNIT - HALF
                 s = u * u + v * v
                 if kinds[i, j] != SPHERE or s < _QUARTER:
                     break
             if kinds[i, j] == SPHERE:
                 # the direction that belongs to a point of the disc (G. Marsaglia 1972)
-                ring = _FOUR * np.sqrt(_ONE - _FOUR * s)
+                ring = _FOUR * np.sqrt(ONE - _FOUR * s)
                 radius = params[i, j, 3]
                 out[i, filled, 0] = params[i, j, 0] + radius * ring * u
                 out[i, filled, 1] = params[i, j, 1] + radius * ring * v
-                out[i, filled, 2] = params[i, j, 2] + radius * (_ONE - _TWO * _FOUR * s)
+                out[i, filled, 2] = params[i, j, 2] + radius * (ONE - _TWO * _FOUR * s)
             else:
                 # The point (u, v) on one of the six faces: the offset of `pick` within the area of the box
                 # chooses a pair of opposite faces, and the lowest bit of x one of the two. The columns of
                 # `axes` are the edges of the box. Column `face` is normal to the pair; columns face - 1 and
                 # face - 2 are the other two edges (negative indices count from the end).
-                offset = pick - (ends[j - 1] if j > 0 else _ZERO)
-                side = _HALF if x & np.uint64(1) else -_HALF
+                offset = pick - (ends[j - 1] if j > 0 else ZERO)
+                side = HALF if x & np.uint64(1) else -HALF
                 face = int(offset >= faces[j, 0]) + int(offset >= faces[j, 1])
                 for r in range(3):
                     axis = axes[j, r]
@@ -142,7 +139,7 @@ def fill_clouds(kinds, params, seeds, region, out):
                 filled += 1
         for p in range(filled, count):
             for r in range(3):
-                out[i, p, r] = out[i, p - filled, r] if filled > 0 else _ZERO
+                out[i, p, r] = out[i, p - filled, r] if filled > 0 else ZERO
 
 
 @kernel(error_model="numpy")
@@ -151,11 +148,11 @@ def _prepare(kind, row, faces, axes):
     `faces` the area of the pair of faces that are normal to the first edge, and this area plus that of the
     second pair."""
     if kind == NONE:
-        return _ZERO
+        return ZERO
     if kind == SPHERE:
         a = b = c = _TWO * row[3]
         area = _PI * a * a
-        write_rotation(_ONE, _ZERO, _ZERO, _ZERO, axes)
+        write_rotation(ONE, ZERO, ZERO, ZERO, axes)
     else:
         a = row[3]
         b = row[4]
@@ -174,11 +171,11 @@ def _prepare(kind, row, faces, axes):
 @kernel()
 def _may_intersect(region, row, axes):
     """Whether the bounding box of a shape reaches into the region."""
-    squared_gap = _ZERO
-    half = _ZERO
+    squared_gap = ZERO
+    half = ZERO
     for r in range(3):
-        half = _HALF * (abs(axes[r, 0]) + abs(axes[r, 1]) + abs(axes[r, 2]))
-        away = max(abs(row[r] - region[r]) - half, _ZERO)
+        half = HALF * (abs(axes[r, 0]) + abs(axes[r, 1]) + abs(axes[r, 2]))
+        away = max(abs(row[r] - region[r]) - half, ZERO)
         squared_gap += away * away
     # `half` is now half the box's height
     return row[2] + half > region[4] and squared_gap < region[3] * region[3]

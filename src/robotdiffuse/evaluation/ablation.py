@@ -181,7 +181,7 @@ def run_ablation(
     read_manifest(settings.data).check_robot(load_robot("panda"))
     configs = dict.fromkeys(ROWS[name].config for name in rows)
     trainings = [Training(config, seed) for config in configs for seed in range(settings.seeds)]
-    evaluations: dict[tuple[Training | str, bool], Evaluation] = {}
+    evaluations = dict[tuple[Training | str, bool], Evaluation]()
     with lock_folder(out), Workers(workers, patience=STOP_TIMEOUT) as pool:
         if not (out / ENCODER / "encoder.json").exists():
             report(f"training {ENCODER}: {counted(settings.encoder_samples, 'cloud')}")

@@ -23,6 +23,7 @@ from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, check_name
 from robotdiffuse.core.files import JsonLines, append_line, is_file, lock_folder, writing
 from robotdiffuse.core.settings import Count, Filled, OneOf, Positive, Settings
+from robotdiffuse.core.types import Done
 from robotdiffuse.evaluation.metrics import measured
 from robotdiffuse.evaluation.report import processor, versions
 from robotdiffuse.evaluation.runs import (
@@ -176,7 +177,7 @@ class PlannerProcess:
         if answer is not None:
             return [answer]
         answer = self._ask(run.limit + GRACE, _first_answer, problem, run.seed, run.limit, restarts)
-        answers: list[Fields] = []
+        answers = list[Fields]()
         while answer is not None:
             answers.append(answer)
             if answer["status"] in (CRASHED, OVERRAN):
@@ -210,7 +211,7 @@ _request: Fields
 # Answers of the current run that have not been sent yet
 _answers: Iterator[Fields]
 # Robots for which the planner has been warmed up
-_warm: set[Robot] = set()
+_warm = set[Robot]()
 
 
 def _prepare(spec: PlannerSpec, log: str, cpu_time: bool) -> None:
@@ -273,7 +274,7 @@ def on_this_machine(settings: "BenchSettings", runs: Sequence[Run], session: str
     }
     pool = ThreadPoolExecutor(workers)
     todo = list(runs)
-    running: dict[Future[list[Fields]], Run] = {}
+    running = dict[Future[list[Fields]], Run]()
     try:
         for job in [pool.submit(planners[label].warm, run) for label, run in first.items()]:
             job.result()
@@ -298,7 +299,7 @@ def on_cluster(settings: "BenchSettings", runs: Sequence[Run], session: str) -> 
 
     The nodes need this package, and weights and other files at the same paths as this machine.
     """
-    tasks: list[tuple[PlannerSpec, list[Run], bool]] = []
+    tasks = list[tuple[PlannerSpec, list[Run], bool]]()
     assert settings.cluster is not None
     for label, spec in settings.specs.items():
         planner_runs = [run for run in runs if run.method == label]
@@ -388,10 +389,6 @@ class BenchSettings(Settings):
         return specs
 
 
-Done = Callable[[int, int], None]
-"""Called with the number of finished calls and the total number of calls."""
-
-
 def run_bench(settings: BenchSettings, report: Progress, done: Done) -> int:
     """Make the calls that have no record in the folder; returns how many were made.
 
@@ -424,7 +421,7 @@ def open_runs(
 ) -> list[Run]:
     """The runs that are still to be made: those that no record answers (see `run_bench`). `records` are the
     existing records by planner."""
-    answered: set[tuple[str, str, str, int]] = set()
+    answered = set[tuple[str, str, str, int]]()
     for label in settings.specs:
         restarted = {record.key for record in records.get(label + RESTARTED, ())}
         for record in records.get(label, ()):

@@ -637,7 +637,7 @@ def _indicators(outcomes: Sequence[Outcome]) -> Indicators:
 def _problem_lengths(keys: Sequence[Key], outcomes: Sequence[Outcome]) -> Values:
     """The joint-space length of each problem [rad]: the median over the seeds; NaN if the planner failed with
     half or more of the seeds."""
-    lengths: dict[str, list[float]] = {}
+    lengths = dict[str, list[float]]()
     for (name, _), o in zip(keys, outcomes, strict=True):
         lengths.setdefault(name, []).append(o.joint_length)
     values = map(np.array, lengths.values())

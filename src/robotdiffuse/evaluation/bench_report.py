@@ -28,7 +28,7 @@ from robotdiffuse.evaluation.bench_comparisons import (
     solved_share,
 )
 from robotdiffuse.evaluation.metrics import METRICS, Metric
-from robotdiffuse.evaluation.report import Report, draw_plot, interval
+from robotdiffuse.evaluation.report import Report, draw_plot
 from robotdiffuse.evaluation.runs import (
     CRASHED,
     OVERRAN,
@@ -202,8 +202,8 @@ def _ratio(comparison: Comparison, reference: str) -> PlannerColumn:
         sign = "" if row.full and full.get(reference, True) else UNEQUAL
         if pair is None or pair.ratio_interval is None or (sign and row.planner + RESTARTED in full):
             return None
-        ends = interval(*pair.ratio_interval, digits=3)
-        return Figure(f"{pair.ratio:.3f} ({ends}){sign}", pair.ratio or 0.0)
+        low, high = pair.ratio_interval
+        return Figure(f"{pair.ratio:.3f} ({low:.3f} to {high:.3f}){sign}", pair.ratio or 0.0)
 
     return Column(f"joint length / {named(reference)}"), ratio
 
@@ -323,7 +323,7 @@ def missing_line(comparison: Comparison) -> str:
 
 def about(bench: Bench) -> list[str]:
     """Machine, dates and versions of the sessions: one line for each combination of machine and versions."""
-    dates: dict[str, list[str]] = {}
+    dates = dict[str, list[str]]()
     for run in bench.sessions:
         versions = ", ".join(f"{name} {version}" for name, version in run["versions"].items())
         machine = f"{run.get('processor', '?')}, {counted(run.get('cores', '?'), 'core')}"
@@ -388,7 +388,7 @@ def motions_to_replay(bench: Bench, parts: Sequence[Section]) -> list[Replay]:
     Motions are those of the main comparison of each problem set. Only problems that are stored in the folder
     are considered.
     """
-    tries: list[tuple[Case, list[Record], dict[str, str]]] = []
+    tries = list[tuple[Case, list[Record], dict[str, str]]]()
     # sections that hold only the non-trivial problems are left out
     for section in (section for section in parts if section.name == section.problem_set):
         main = section.main

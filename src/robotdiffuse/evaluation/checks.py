@@ -9,7 +9,7 @@ its own kinematics.
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING
@@ -22,7 +22,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Natural, converted
 from robotdiffuse.core.tables import Column, Table
-from robotdiffuse.core.types import Path, frozen_dataclass
+from robotdiffuse.core.types import Done, Path, frozen_dataclass, unreported
 from robotdiffuse.datasets.shards import (
     Manifest,
     Shard,
@@ -156,7 +156,7 @@ def check_data(
     seed: int = 0,
     workers: int = 1,
     pybullet: bool = True,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Done = unreported,
 ) -> DataCheck:
     """Check the structure of every shard, and `count` random motions (all by default).
 
@@ -335,7 +335,7 @@ class Confirmation:
     the first contact."""
 
 
-def confirm(out: FilePath, count: int | None, progress: Callable[[int, int], None]) -> Confirmation:
+def confirm(out: FilePath, count: int | None, progress: Done) -> Confirmation:
     """Check the returned motions in a folder of `bench run` with PyBullet.
 
     Args:
@@ -349,7 +349,7 @@ def confirm(out: FilePath, count: int | None, progress: Callable[[int, int], Non
     from robotdiffuse.simulation.validator import PyBulletOracle
 
     records = [record for planner_records in read_records(out).values() for record in planner_records]
-    solved: dict[tuple[str, str], list[Record]] = {}
+    solved = dict[tuple[str, str], list[Record]]()
     for record in records:
         if record.solved:
             solved.setdefault((record.problem_set, record.name), []).append(record)

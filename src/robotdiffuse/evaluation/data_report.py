@@ -108,7 +108,7 @@ def read_figures(folder: str | Path) -> DataFigures:
     indices = existing_shards(folder)
     step = max(1, manifest.trajectories // SAMPLED_MOTIONS)
     waypoints = np.unique(np.linspace(0, manifest.waypoints - 1, SAMPLED_WAYPOINTS).round().astype(int))
-    parts: dict[str, list[ndarray]] = {}
+    parts = dict[str, list[ndarray]]()
     counts = Counter[str]()
     splits: dict[str, int] = dict.fromkeys(SPLITS, 0)
     size = 0

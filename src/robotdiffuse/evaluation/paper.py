@@ -20,8 +20,8 @@ from robotdiffuse.baselines.controls import NEAREST
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.tables import Column, Table, plain
-from robotdiffuse.core.types import Configurations, Path
-from robotdiffuse.evaluation.bench import BenchSettings, Done, run_bench
+from robotdiffuse.core.types import Configurations, Done, Path
+from robotdiffuse.evaluation.bench import BenchSettings, run_bench
 from robotdiffuse.evaluation.bench_comparisons import (
     Bench,
     Indicators,
@@ -391,7 +391,7 @@ def table1(settings: Table1Settings, bench: Bench) -> Report:
         label: [r for r in bench.records[label] if r.name in names and r.time_limit == settings.time_limit]
         for label in rows
     }
-    loads: list[float] = []
+    loads = list[float]()
     for section in sections(replace(bench, records=records), [settings.time_limit]):
         loads += section.main.loads
         report.table(_table(section, rows), level=2)
@@ -528,7 +528,7 @@ def denoising(problem: Problem) -> list[Noisy]:
     predict = model.predictor(
         reference, model.condition(embedding, start, goal), link_clearances(checker, model.settings)
     )
-    states: list[tuple[float, ndarray]] = []
+    states = list[tuple[float, ndarray]]()
 
     def recorded(x: ndarray, level: int) -> ndarray:
         states.append((level / model.schedule.steps, model.hold_ends(x.copy(), reference)))

@@ -42,7 +42,7 @@ class Report:
     def __init__(self, title: str) -> None:
         self.title = title
         self.blocks = [f"# {plain(title)}"]
-        self.plots: dict[str, str] = {}
+        self.plots = dict[str, str]()
         """SVG by file name."""
 
     def add(self, *blocks: str) -> None:
@@ -104,14 +104,10 @@ class Report:
             write_atomically(file.with_name(name), svg.replace("<svg ", '<svg style="background: white" ', 1))
 
 
-def interval(low: float, high: float, digits: int = 1, scale: float = 1.0) -> str:
-    """An interval as text, such as "1.2 to 3.4"; both ends are multiplied by `scale`."""
-    return f"{scale * low:.{digits}f} to {scale * high:.{digits}f}"
-
-
 def share_cell(value: float, ends: tuple[float, float]) -> Figure:
     """A cell with a fraction and its interval, in percent."""
-    return Figure(f"{100 * value:.1f} ({interval(*ends, scale=100.0)})", value)
+    low, high = ends
+    return Figure(f"{100 * value:.1f} ({100 * low:.1f} to {100 * high:.1f})", value)
 
 
 def processor() -> str:

@@ -18,7 +18,7 @@ import os
 import time
 import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -204,7 +204,7 @@ def _parts(place: FilePath) -> list[FilePath]:
 def _interleaved(cases: list[Case]) -> list[Case]:
     """The cases, ordered by taking one of each family in turn, so that the first cases are of all
     families."""
-    families: dict[str, list[Case]] = {}
+    families = dict[str, list[Case]]()
     for case in cases:
         families.setdefault(case.family, []).append(case)
     rows = itertools.zip_longest(*families.values())
@@ -353,7 +353,7 @@ class RecordFile:
         """Read the file; an incomplete last line is ignored. Raises InputError with file and line for any
         other line that is not a record."""
         self._lines = JsonLines(file)
-        self.records: list[Record] = []
+        self.records = list[Record]()
         for number, row in enumerate(self._lines.rows, start=1):
             try:
                 self.records.append(record_of_row(row))
@@ -444,23 +444,15 @@ Results = Generator[tuple[Run, list[Record]], None, None]
 """Runs with their records, in the order in which the runs end."""
 
 
-class Clock:
-    """Measures wall time and CPU time of this process in a `with` block [s]."""
-
-    wall = cpu = 0.0
-
-    def __enter__(self) -> "Clock":
-        self._wall = time.perf_counter()
-        self._cpu = time.process_time()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.wall = time.perf_counter() - self._wall
-        self.cpu = time.process_time() - self._cpu
-
-    @property
-    def fields(self) -> Fields:
-        return {"time": round(self.wall, 6), "cpu": round(self.cpu, 6)}
+@contextmanager
+def clocked() -> Iterator[Fields]:
+    """Yields fields to which the wall time and the CPU time of this process in the `with` block are added at
+    its end [s]."""
+    seconds = Fields()
+    wall = time.perf_counter()
+    cpu = time.process_time()
+    yield seconds
+    seconds |= {"time": round(time.perf_counter() - wall, 6), "cpu": round(time.process_time() - cpu, 6)}
 
 
 def runs_of(cases: Sequence[Case], methods: Iterable[str], seeds: Iterable[int], limit: float) -> list[Run]:
@@ -553,11 +545,7 @@ UNSOLVED = Status.NO_PATH.value
 
 def planned(planner: Planner, **request: Any) -> Method:
     """A method that calls a planner in this process; `request` are further arguments of `Planner.plan`."""
-
-    def call(run: Run) -> Iterator[Fields]:
-        yield from planner_calls(planner, run.problem, run.seed, run.limit, False, request)
-
-    return call
+    return lambda run: planner_calls(planner, run.problem, run.seed, run.limit, False, request)
 
 
 def planner_calls(
@@ -572,9 +560,9 @@ def planner_calls(
     fields of the record of all calls together (`restarted`). An exception gives a record too."""
     began = time.perf_counter()
     try:
-        with Clock() as clock:
+        with clocked() as seconds:
             result = planner.plan(problem, time_limit=limit, seed=seed, **request)
-        yield {"cpu": clock.fields["cpu"], **fields_of(result, problem.robot)}
+        yield {"cpu": seconds["cpu"], **fields_of(result, problem.robot)}
         if restarts and result.status.value in RESTARTABLE and result.planning_time < ENDED_EARLY * limit:
             count, result = restarted(planner, problem, seed, limit, result, request)
             yield {"restarts": count, **fields_of(result, problem.robot)}
@@ -685,7 +673,7 @@ def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) ->
     def call(run: Run) -> Iterator[Fields]:
         problem = run.problem
         checker = CollisionChecker(problem.robot, problem.scene)
-        with Clock() as clock:
+        with clocked() as seconds:
             q = draw(run, checker)
         verdict = validated(problem, q)
         measures = {}
@@ -697,7 +685,7 @@ def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) ->
             "status": SOLVED if measures else UNSOLVED,
             "passed": float(verdict.passed.mean()),
             "collided": float(verdict.hit.mean()),
-            **clock.fields,
+            **seconds,
             **measures,
         }
 
@@ -740,8 +728,6 @@ def from_network(
 def from_control(settings: ControlSettings) -> Draw:
     """Draws the candidates of a control."""
     control = Control(settings)
-
-    def draw(run: Run, checker: CollisionChecker) -> ndarray:
-        return control.candidates(run.problem.start, goal_of(run.problem)[None], checker, run.rng())
-
-    return draw
+    return lambda run, checker: control.candidates(
+        run.problem.start, goal_of(run.problem)[None], checker, run.rng()
+    )

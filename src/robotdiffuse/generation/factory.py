@@ -6,7 +6,6 @@ The content of a shard depends only on the settings and on the shard's number.
 
 import json
 import platform
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
@@ -34,7 +33,7 @@ from robotdiffuse.core.settings import (
     SettingsOf,
     Share,
 )
-from robotdiffuse.core.types import Configurations, Path, interpolated
+from robotdiffuse.core.types import Configurations, Done, Path, interpolated, unreported
 from robotdiffuse.datasets.shards import (
     MANIFEST,
     Arrays,
@@ -168,7 +167,7 @@ def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts
     """
     robot = load_robot(settings.robot)
     rows = settings.rows(index)
-    solved_rows: list[Row] = []
+    solved_rows = list[Row]()
     counts: Counts = dict.fromkeys(("tried", "solved", "thinned", "unsolved", "refused"), 0)
     while len(solved_rows) < rows:
         if counts["tried"] >= MAX_PROBLEMS_PER_ROW * rows + EXTRA_PROBLEMS:
@@ -275,7 +274,7 @@ def generate(
     out: FilePath,
     workers: int = 1,
     cluster: str | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Done = unreported,
 ) -> int:
     """Make the shards that the folder lacks. Returns the number of trajectories in the whole data set.
 

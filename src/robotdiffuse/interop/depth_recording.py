@@ -181,10 +181,10 @@ def _read(
 ) -> Iterator[StampedView]:
     kinds = recording.kinds
     images = _image_topics(kinds, topics)
-    states_of: dict[str, _States] = {}
+    states_of = dict[str, _States]()
     transforms = TransformHistory()
-    infos: dict[str, JsonObject] = {}
-    units: dict[str, float] = {}
+    infos = dict[str, JsonObject]()
+    units = dict[str, float]()
     has_states = JOINT_STATE in kinds.values()
     # topics with the meters per unit of a sensor's depth images, in bags of librealsense
     unit_topics = [name for name in kinds if name.replace(" ", "_").endswith("/option/Depth_Units/value")]
@@ -309,9 +309,9 @@ class TransformHistory:
     """Poses of frames relative to their parent frames, at the times when they were published."""
 
     def __init__(self) -> None:
-        self._parent: dict[str, str] = {}
-        self._static: set[str] = set()
-        self._poses: dict[str, list[tuple[float, Pose]]] = {}
+        self._parent = dict[str, str]()
+        self._static = set[str]()
+        self._poses = dict[str, list[tuple[float, Pose]]]()
         """Sorted by time: messages may be logged in another order than that of their stamps."""
 
     def add(self, message: Mapping[str, Any], static: bool, logged: int = 0) -> None:
@@ -364,7 +364,7 @@ class _States:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self.known: list[tuple[float, JointValues]] = []
+        self.known = list[tuple[float, JointValues]]()
 
     def add(self, stamp: float, state: Mapping[str, Any]) -> None:
         """Add a message, if it has positions of all joints of the arm."""

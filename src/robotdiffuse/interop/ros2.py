@@ -104,7 +104,7 @@ MOVEIT = {
 def typestore() -> Typestore:
     """The message types of ROS 2 Humble and MoveIt."""
     store = get_typestore(Stores.ROS2_HUMBLE)
-    types: dict[str, Any] = {}
+    types = dict[str, Any]()
     for name, definition in MOVEIT.items():
         types |= get_types_from_msg(definition, name)
     store.register(types)
@@ -250,7 +250,7 @@ class McapWriter:
     def __init__(self, stream: io.BytesIO | io.BufferedWriter) -> None:
         self.writer = Writer(stream)
         self.writer.start(profile="", library="robotdiffuse")
-        self._channels: dict[str, int] = {}
+        self._channels = dict[str, int]()
 
     def protobuf(self, topic: str, content: Any, at: int) -> None:
         if topic not in self._channels:

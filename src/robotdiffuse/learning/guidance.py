@@ -31,15 +31,13 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP, cost_gradient_at, make_cost_workspace
 from robotdiffuse.collision.kernels.lane_clearance import make_clearance_workspace, pair_clearances_into
-from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
+from robotdiffuse.core.kernels import ONE, ZERO, allocation_free, inner_kernel, kernel
 from robotdiffuse.core.settings import NotNegative, Positive, Settings, Share
 from robotdiffuse.core.types import Values
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.constraint_kernel import make_work
 from robotdiffuse.problems.projection_kernel import step
 
-_ZERO = np.float32(0.0)
-_ONE = np.float32(1.0)
 OFF = -CLEARANCE_CAP
 """The margin of a cost that is not enabled: no distance is ever below it."""
 
@@ -81,18 +79,18 @@ def descend(robot, scene, q, lower, upper, steps, rounds):
     pushed = max(steps.margin, steps.self_margin) > OFF
     for b in range(batch):
         for _ in range(rounds):
-            total = _ZERO
+            total = ZERO
             if steps.self_margin > OFF:
                 pair_clearances_into(robot, q[b], steps.self_margin, work, pairs)
             for i in range(first, last):
-                gradient[:] = _ZERO
+                gradient[:] = ZERO
                 cost = cost_gradient_at(
                     robot, scene, q[b, i], pairs[i], steps.margin, steps.self_margin, scratch, gradient
                 )
                 total += cost
                 active[i] = _push_away(cost, gradient, steps.push, pushes[i])
             costs[b] = total
-            if pushed and total <= _ZERO:
+            if pushed and total <= ZERO:
                 break
             _spread(q[b], first, last, pushes, active, steps.spread_weights, lower, upper)
             _shorten(q[b], first, last, steps.length)
@@ -107,17 +105,17 @@ def _push_away(cost, gradient, push, out):
     The step just clears a single contact, at any scale of the cost. Returns 1 if there is a contact,
     else 0.
     """
-    out[:] = _ZERO
-    square = _ZERO
+    out[:] = ZERO
+    square = ZERO
     for j in range(len(gradient)):
         square += gradient[j] * gradient[j]
-    if cost <= _ZERO or square <= np.float32(1e-12):
-        return _ZERO
+    if cost <= ZERO or square <= np.float32(1e-12):
+        return ZERO
     scale = np.float32(2.0) * cost / square
     scale = min(scale, push / np.sqrt(square))
     for j in range(len(gradient)):
         out[j] = -scale * gradient[j]
-    return _ONE
+    return ONE
 
 
 @allocation_free(fastmath=True)
@@ -126,14 +124,14 @@ def _spread(q, first, last, pushes, active, spread_weights, lower, upper):
     neighbors; by less if only distant neighbors are pushed."""
     dof = q.shape[1]
     for i in range(first, last):
-        weight = _ZERO
+        weight = ZERO
         for k in range(first, last):
             weight += spread_weights[i, k] * active[k]
         if weight <= np.float32(1e-4):
             continue
-        weight = _ONE / max(weight, _ONE)
+        weight = ONE / max(weight, ONE)
         for k in range(first, last):
-            if active[k] > _ZERO and spread_weights[i, k] > np.float32(1e-3):
+            if active[k] > ZERO and spread_weights[i, k] > np.float32(1e-3):
                 share = weight * spread_weights[i, k]
                 for j in range(dof):
                     q[i, j] += share * pushes[k, j]

@@ -116,15 +116,15 @@ GuideFn = Callable[[ndarray, float], ndarray]
 improved joint values."""
 
 
-MAX_WAYPOINTS = 4096.0
-"""Largest number of waypoints, which bounds the memory of the waypoints x waypoints matrices."""
+Waypoints = Annotated[int, Bound(least=3.0, most=4096.0)]
+"""A number of waypoints. The upper bound limits the memory of the waypoints x waypoints matrices."""
 
 
 @dataclass(frozen=True)
 class ModelParts(Settings):
     """The settings that a model and its training have in common."""
 
-    waypoints: Annotated[int, Bound(least=3.0, most=MAX_WAYPOINTS)] = 48
+    waypoints: Waypoints = 48
     """Number of waypoints of a trajectory, evenly spaced in joint-space length (paper: 254)."""
     denoiser: Annotated[str, OneOf(DENOISERS)] = "transformer"
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)

@@ -183,7 +183,7 @@ def group_points(
     clouds = torch.arange(len(points))
     chosen = (points - points.mean(1, keepdim=True)).norm(dim=-1).argmax(1)
     min_distances = torch.full_like(distances[:, 0], torch.inf)
-    center_indices: list[Tensor] = []
+    center_indices = list[Tensor]()
     for _ in range(count):
         center_indices.append(chosen)
         min_distances = torch.minimum(min_distances, distances[clouds, chosen])

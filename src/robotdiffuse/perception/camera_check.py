@@ -5,13 +5,11 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float32
-from numpy import ndarray
 
 from robotdiffuse.core.errors import shown
 from robotdiffuse.core.transforms import placed, pose, quaternion_from_rotation
 from robotdiffuse.core.types import Configuration
-from robotdiffuse.perception.depth_view import FARTHEST, NEAREST, DepthView
+from robotdiffuse.perception.depth_view import FARTHEST, NEAREST, DepthImage, DepthView
 from robotdiffuse.perception.ray_caster import ray_cast
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -52,16 +50,12 @@ FOCAL_FACTORS = (0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0)
 """Factors for the focal length that are tried, in case the image was resized after the calibration."""
 
 
-Cells = Float32[ndarray, "rows columns"]
-"""Depth of each cell of an image [m]."""
-
-
 def agreement(view: DepthView, robot: Robot, q: Configuration) -> tuple[float, float, int]:
     """Compares an image with the arm's model at a configuration; see `_compared`."""
     return _compared(*_images(view, robot, q))
 
 
-def _images(view: DepthView, robot: Robot, q: Configuration) -> tuple[Cells, Cells]:
+def _images(view: DepthView, robot: Robot, q: Configuration) -> tuple[DepthImage, DepthImage]:
     """The depths of the image's cells, and those at which the model at a configuration shows the arm
     (infinite elsewhere) [m]."""
     step = min(max(1, round(STEP_ANGLE * view.intrinsics[0])), *view.depth.shape)
@@ -71,7 +65,7 @@ def _images(view: DepthView, robot: Robot, q: Configuration) -> tuple[Cells, Cel
     return cells, ray_cast(NOTHING, view.T_base_camera, cell_intrinsics, cells.shape[::-1], robot, q).depth
 
 
-def _compared(cells: Cells, arm: Cells) -> tuple[float, float, int]:
+def _compared(cells: DepthImage, arm: DepthImage) -> tuple[float, float, int]:
     """For the cells in which the model shows the arm and the image has a depth: the fraction whose depth is
     the arm's, the fraction that sees through the arm (larger depths), and the number of these cells."""
     compared = np.isfinite(arm) & (cells > 0)

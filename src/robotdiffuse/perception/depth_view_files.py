@@ -194,8 +194,8 @@ def read_views(entries: object, folder: Path) -> tuple[tuple[DepthView, ...], tu
     """
     if not isinstance(entries, list):
         raise InputError(f"views is {shown(entries)}; it must be a list of views, each with depth or cloud")
-    views: list[DepthView] = []
-    notes: list[str] = []
+    views = list[DepthView]()
+    notes = list[str]()
     for i, entry in enumerate(entries):
         with located(f"views[{i}]"):
             views.append(_view(f"views[{i}]", entry, folder, notes))

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32, Int32, UInt8
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, counted
-from robotdiffuse.core.kernels import kernel
+from robotdiffuse.core.kernels import HALF, ONE, ZERO, kernel
 from robotdiffuse.core.transforms import seen_from
 from robotdiffuse.core.types import Configuration, frozen_dataclass
 from robotdiffuse.perception.depth_filter import (
@@ -62,9 +62,6 @@ PIXEL_SLACK = np.float32(0.01)
 """Larger than the rounding errors of image coordinates [pixels]."""
 DEPTH_SLACK = np.float32(1e-4)
 """Larger than the rounding errors of depths [m]."""
-_HALF = np.float32(0.5)
-_ONE = np.float32(1.0)
-_ZERO = np.float32(0.0)
 _NEAREST = np.float32(NEAREST)
 
 
@@ -77,7 +74,7 @@ def usable_depth(depth, focal):
     for v in range(h):
         for u in range(w):
             d = depth[v, u]
-            out[v, u] = min(d, MAX_DEPTH) if d >= _NEAREST else (d if d < _ZERO else NO_RETURN)
+            out[v, u] = min(d, MAX_DEPTH) if d >= _NEAREST else (d if d < ZERO else NO_RETURN)
     flying = np.zeros((h, w), np.bool_)
     for v in range(1, h - 1):
         for u in range(1, w - 1):
@@ -88,8 +85,8 @@ def usable_depth(depth, focal):
             b = out[v, u + 1]
             c = out[v - 1, u]
             e = out[v + 1, u]
-            across = (a > _ZERO) & (b > _ZERO) & (min(a, b) < d - step) & (max(a, b) > d + step)
-            along = (c > _ZERO) & (e > _ZERO) & (min(c, e) < d - step) & (max(c, e) > d + step)
+            across = (a > ZERO) & (b > ZERO) & (min(a, b) < d - step) & (max(a, b) > d + step)
+            along = (c > ZERO) & (e > ZERO) & (min(c, e) < d - step) & (max(c, e) > d + step)
             flying[v, u] = across | along
     for v in range(h):
         for u in range(w):
@@ -219,7 +216,7 @@ def _rectangle_minimum(table, v0, v1, u0, u1):
 @kernel(fastmath=FASTMATH, inline="always")
 def _cells(middle, half, share):
     """The first and last cell of an interval of pixels. share: cells per pixel."""
-    return int((middle - half + _HALF) * share), int((middle + half + _HALF) * share)
+    return int((middle - half + HALF) * share), int((middle + half + HALF) * share)
 
 
 @kernel(inline="always")
@@ -238,7 +235,7 @@ def _count_points(depth, arm, intrinsics, T, low, voxel, counts):
     fnx = np.float32(nx)
     fny = np.float32(ny)
     fnz = np.float32(nz)
-    scale = _ONE / voxel
+    scale = ONE / voxel
     # the camera's position (ox, oy, oz), from the grid's lower corner, in units of a voxel's edge
     ox = (T[0, 3] - low[0]) * scale
     oy = (T[1, 3] - low[1]) * scale
@@ -257,11 +254,11 @@ def _count_points(depth, arm, intrinsics, T, low, voxel, counts):
             x = ox + (rx + T[0, 0] * a) * d
             y = oy + (ry + T[1, 0] * a) * d
             z = oz + (rz + T[2, 0] * a) * d
-            inside = (x >= _ZERO) & (y >= _ZERO) & (z >= _ZERO) & (x < fnx) & (y < fny) & (z < fnz)
-            inside &= (d > _ZERO) & ~hidden[u]
-            x = min(max(x, _ZERO), fnx)
-            y = min(max(y, _ZERO), fny)
-            z = min(max(z, _ZERO), fnz)
+            inside = (x >= ZERO) & (y >= ZERO) & (z >= ZERO) & (x < fnx) & (y < fny) & (z < fnz)
+            inside &= (d > ZERO) & ~hidden[u]
+            x = min(max(x, ZERO), fnx)
+            y = min(max(y, ZERO), fny)
+            z = min(max(z, ZERO), fnz)
             index = (np.int32(x) * np.int32(ny) + np.int32(y)) * np.int32(nz) + np.int32(z)
             at[u] = index if inside else np.int32(-1)
         for u in range(w):
@@ -297,7 +294,7 @@ def carve(depth, intrinsics, T, spheres, low, voxel, errors, state, behind, coun
                 )
                 if block_state >= 0:
                     state[i : end[0], j : end[1], k : end[2]] = block_state
-                    behind[i : end[0], j : end[1], k : end[2]] = _ZERO
+                    behind[i : end[0], j : end[1], k : end[2]] = ZERO
                 else:
                     _carve_block(
                         first,
@@ -326,10 +323,10 @@ def _half_sizes(T, x, y, half, error):
     half: half the edge of the cube [m]. error: by how far the cube may be displaced [m]. x, y: the direction
     (x, y, 1) of its center in the camera's frame.
     """
-    du = _ZERO
-    dv = _ZERO
-    u_square = _ZERO
-    v_square = _ZERO
+    du = ZERO
+    dv = ZERO
+    u_square = ZERO
+    v_square = ZERO
     for c in range(3):
         across = T[c, 0] - x * T[c, 2]
         along = T[c, 1] - y * T[c, 2]
@@ -348,13 +345,13 @@ def _state_of_block(first, intrinsics, T, low, voxel, errors, size, factor, tabl
     first: indices of the block's first voxel. size: height and width of the image.
     """
     fx, fy, cx, cy = intrinsics
-    middle = _HALF * np.float32(BLOCK)
+    middle = HALF * np.float32(BLOCK)
     px = low[0] + (np.float32(first[0]) + middle) * voxel - T[0, 3]
     py = low[1] + (np.float32(first[1]) + middle) * voxel - T[1, 3]
     pz = low[2] + (np.float32(first[2]) + middle) * voxel - T[2, 3]
     x, y, z = in_camera(T, px, py, pz)
     # half the extent of a voxel in depth, and the range of depths of the block [m]
-    ez = _HALF * voxel * (abs(T[0, 2]) + abs(T[1, 2]) + abs(T[2, 2]))
+    ez = HALF * voxel * (abs(T[0, 2]) + abs(T[1, 2]) + abs(T[2, 2]))
     near = z - np.float32(BLOCK) * ez
     far = z + np.float32(BLOCK) * ez
     if far <= ez:
@@ -368,24 +365,19 @@ def _state_of_block(first, intrinsics, T, low, voxel, errors, size, factor, tabl
     du, dv = _half_sizes(T, x, y, middle * voxel, error)
     # an upper bound of the 1 / (z - ez) that `_carve_block` uses for a voxel; ez / near is added since the
     # voxel's x and y differ from the block's
-    wider = (_ONE + ez / near) / near
-    far = far + error * (_ONE + far / near) + errors[2] * far * far
+    wider = (ONE + ez / near) / near
+    far = far + error * (ONE + far / near) + errors[2] * far * far
     u = fx * x + cx
     v = fy * y + cy
     du = fx * wider * du + PIXEL_SLACK
     dv = fy * wider * dv + PIXEL_SLACK
     h, w = size
-    if (
-        u + du < -_HALF
-        or v + dv < -_HALF
-        or u - du >= np.float32(w) - _HALF
-        or v - dv >= np.float32(h) - _HALF
-    ):
+    if u + du < -HALF or v + dv < -HALF or u - du >= np.float32(w) - HALF or v - dv >= np.float32(h) - HALF:
         return OUT
-    share = _ONE / np.float32(factor)
+    share = ONE / np.float32(factor)
     u0, u1 = _cells(u, du, share)
     v0, v1 = _cells(v, dv, share)
-    if u - du < -_HALF or v - dv < -_HALF or u1 >= table.shape[2] or v1 >= table.shape[1]:
+    if u - du < -HALF or v - dv < -HALF or u1 >= table.shape[2] or v1 >= table.shape[1]:
         return -1
     if _rectangle_sum(missing, v0, v1, u0, u1):
         return -1
@@ -401,17 +393,17 @@ def _carve_block(
     """Does the work of `carve` for the voxels of one block."""
     fx, fy, cx, cy = intrinsics
     h, w = table.shape[1:]
-    share = _ONE / np.float32(factor)
-    half = _HALF * voxel
+    share = ONE / np.float32(factor)
+    half = HALF * voxel
     ez = half * (abs(T[0, 2]) + abs(T[1, 2]) + abs(T[2, 2]))  # half the extent of a voxel in depth [m]
     for i in range(first[0], end[0]):
-        px = low[0] + (np.float32(i) + _HALF) * voxel - T[0, 3]
+        px = low[0] + (np.float32(i) + HALF) * voxel - T[0, 3]
         for j in range(first[1], end[1]):
-            py = low[1] + (np.float32(j) + _HALF) * voxel - T[1, 3]
+            py = low[1] + (np.float32(j) + HALF) * voxel - T[1, 3]
             for k in range(first[2], end[2]):
-                pz = low[2] + (np.float32(k) + _HALF) * voxel - T[2, 3]
+                pz = low[2] + (np.float32(k) + HALF) * voxel - T[2, 3]
                 x, y, z = in_camera(T, px, py, pz)
-                behind[i, j, k] = _ZERO
+                behind[i, j, k] = ZERO
                 state[i, j, k] = OUT
                 if z <= ez:
                     continue
@@ -419,8 +411,8 @@ def _carve_block(
                 y = y / z
                 u = fx * x + cx
                 v = fy * y + cy
-                column = int(np.floor(u + _HALF))
-                row = int(np.floor(v + _HALF))
+                column = int(np.floor(u + HALF))
+                row = int(np.floor(v + HALF))
                 if column < 0 or row < 0 or column >= raw.shape[1] or row >= raw.shape[0]:
                     continue
                 if counts[i, j, k] > 0:
@@ -429,20 +421,20 @@ def _carve_block(
                 # the depth at the voxel's center; if there is no return, `front` becomes the nearest depth
                 center_depth = raw[row, column]
                 front = center_depth
-                if front > z + ez or front <= _ZERO:
+                if front > z + ez or front <= ZERO:
                     # The voxel is free if all pixels that it may cover are deeper than `beyond`.
                     # A rotation of the camera moves a point perpendicular to its ray, so it changes the
                     # point's depth only beside the optical axis.
                     aside = errors[1] * z * np.sqrt(x * x + y * y)
                     beyond = z + ez + errors[0] + aside + errors[2] * z * z
-                    du0, dv0 = _half_sizes(T, x, y, half, _ZERO)
+                    du0, dv0 = _half_sizes(T, x, y, half, ZERO)
                     du, dv = _half_sizes(T, x, y, half, errors[0] + errors[1] * z)
                     own_share = du0 * dv0 / (du * dv)  # share of the rectangle that the voxel covers
                     du = fx * du / (z - ez)
                     dv = fy * dv / (z - ez)
                     u0, u1 = _cells(u, du, share)
                     v0, v1 = _cells(v, dv, share)
-                    inside = u - du >= -_HALF and v - dv >= -_HALF and u1 < w and v1 < h
+                    inside = u - du >= -HALF and v - dv >= -HALF and u1 < w and v1 < h
                     u0 = max(0, u0)
                     v0 = max(0, v0)
                     u1 = min(w - 1, u1)
@@ -454,15 +446,15 @@ def _carve_block(
                         inside
                         and nearest > beyond
                         and beyond < errors[3]
-                        and np.float32(lost) <= (_ONE - MIN_RETURN_FRACTION) * pixels
+                        and np.float32(lost) <= (ONE - MIN_RETURN_FRACTION) * pixels
                     ):
                         state[i, j, k] = FREE
                         continue
-                    front = nearest if front <= _ZERO else front
+                    front = nearest if front <= ZERO else front
                 state[i, j, k] = HIDDEN
                 if arm[row, column]:
                     state[i, j, k] = SHADOW
-                elif center_depth <= -_NEAREST or _ZERO < front < LENS_DISTANCE:
+                elif center_depth <= -_NEAREST or ZERO < front < LENS_DISTANCE:
                     state[i, j, k] = LOST
                 elif front < z:
                     state[i, j, k] = BEHIND
@@ -484,8 +476,8 @@ def add_evidence(state, counts, evidence, hit, miss, largest):
         points = counts[v] > 0
         free = state[v] == FREE
         before = evidence[v]
-        gain = hit if points else (-miss if free else _ZERO)
-        new += (points | free) & (before == _ZERO)
+        gain = hit if points else (-miss if free else ZERO)
+        new += (points | free) & (before == ZERO)
         evidence[v] = min(max(before + gain, -largest), largest)
     return new
 

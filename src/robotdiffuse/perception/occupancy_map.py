@@ -12,7 +12,7 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, UInt8
+from jaxtyping import Bool, Int32, UInt8
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import reach_bound
@@ -20,7 +20,7 @@ from robotdiffuse.core import errors
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.locked import locked
 from robotdiffuse.core.settings import Number, converted
-from robotdiffuse.core.types import Configuration, Path, Points, Values, frozen_dataclass
+from robotdiffuse.core.types import Configuration, Path, Points, Spheres, Values, frozen_dataclass
 from robotdiffuse.perception.depth_filter import PointErrors, filtered, point_errors, wide_regions
 from robotdiffuse.perception.depth_view import AssumedPoints, DepthView
 from robotdiffuse.perception.observed_volume import (
@@ -55,8 +55,6 @@ from robotdiffuse.perception.voxel_grid import (
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
-ArmSpheres = Float32[ndarray, "n 4"]
-"""The arm's covering spheres: rows of center x y z and radius [m]."""
 PADDINGS = (0.09, 0.06, 0.04)
 """Radii to which observed points are inflated, the largest first [m]."""
 # Points nearer to the arm's covering spheres at start or goals than PADDING_FACTOR times their padding plus
@@ -81,12 +79,11 @@ class Padded:
     def name(self) -> str:
         return f"points padded by {100 * self.padding:.0f} cm"
 
-    def touched(self, spheres: ArmSpheres) -> Bool[ndarray, "points"]:
-        """Which points touch the arm's covering spheres (x, y, z, radius [m]) at start or goals and have to
-        be carved out."""
+    def touched(self, spheres: Spheres) -> Bool[ndarray, "points"]:
+        """Which points touch the arm's covering spheres at start or goals and have to be carved out."""
         return sphere_distances(self.points, spheres) < PADDING_FACTOR * self.padding + PADDING_MARGIN
 
-    def obstacles(self, spheres: ArmSpheres) -> AssumedPoints:
+    def obstacles(self, spheres: Spheres) -> AssumedPoints:
         """The obstacles without those that touch these spheres."""
         return AssumedPoints(self.points[~self.touched(spheres)], self.padding, name="padded")
 
@@ -105,11 +102,11 @@ class OccupiedVoxels:
     def grid(self) -> VoxelGrid:
         return COARSE if self.occupied.shape == SHAPE else FINE
 
-    def touched(self, spheres: ArmSpheres) -> Voxels:
+    def touched(self, spheres: Spheres) -> Voxels:
         """Which voxels touch these spheres and have to be carved out."""
         return self.occupied & self.grid.within(spheres, CARVING_MARGIN + self.grid.edge / 2)
 
-    def obstacles(self, spheres: ArmSpheres) -> AssumedPoints:
+    def obstacles(self, spheres: Spheres) -> AssumedPoints:
         """The occupied voxels at the boundary of the occupied region; the arm, which starts outside, cannot
         reach inner ones. Voxels out of the arm's reach or in the known scene are left out."""
         edge = self.grid.edge

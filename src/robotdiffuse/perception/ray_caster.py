@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.kernels import kernel
+from robotdiffuse.core.kernels import HALF, ONE, ZERO, kernel
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.core.types import Configuration, Pose, Spheres, Vector
 from robotdiffuse.perception.depth_view import DepthView, Intrinsics
@@ -18,8 +18,6 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Triangulated
 
-_ZERO = np.float32(0.0)
-_ONE = np.float32(1.0)
 FASTMATH = {"contract", "reassoc", "arcp", "nsz"}
 """The fastmath flags that do not assume finite numbers, without approximate functions (afn)."""
 # Surfaces nearer to the camera than this are not rendered [m].
@@ -42,7 +40,7 @@ def rectangle(x, y, z, r, intrinsics, h, w):
     """First and last row, first and last column of the pixels that a sphere in the camera's frame may cover;
     if it covers none, a last index is smaller than its first. h, w: height and width of the image."""
     fx, fy, cx, cy = intrinsics
-    if z + r <= _ZERO:
+    if z + r <= ZERO:
         return 0, -1, 0, -1
     near = max(z - r, _NEAR)
     far = z + r
@@ -52,9 +50,9 @@ def rectangle(x, y, z, r, intrinsics, h, w):
     right = (x + r) / (near if x > -r else far)
     top = (y - r) / (near if y < r else far)
     bottom = (y + r) / (near if y > -r else far)
-    u0 = max(np.floor(left * fx + cx), _ZERO)
+    u0 = max(np.floor(left * fx + cx), ZERO)
     u1 = min(np.ceil(right * fx + cx), np.float32(w - 1))
-    v0 = max(np.floor(top * fy + cy), _ZERO)
+    v0 = max(np.floor(top * fy + cy), ZERO)
     v1 = min(np.ceil(bottom * fy + cy), np.float32(h - 1))
     return int(v0), int(v1), int(u0), int(u1)
 
@@ -63,7 +61,7 @@ def rectangle(x, y, z, r, intrinsics, h, w):
 def _quadratic(a, b, c, last):
     """The smaller root of a t^2 + 2 b t + c, or the larger root if `last`; _MISS if there is no root."""
     under = b * b - a * c
-    if under < _ZERO or a <= _ZERO:
+    if under < ZERO or a <= ZERO:
         return _MISS
     root = np.sqrt(under)
     return (root - b if last else -root - b) / a
@@ -96,9 +94,9 @@ def _intersect(solid, ox, oy, oz, dx, dy, dz):
     a = solid[12]
     c = solid[14]
     r = solid[15]
-    if r > _ZERO and c <= _ZERO:
+    if r > ZERO and c <= ZERO:
         return _sphere(ox, oy, oz, dx, dy, dz, r)
-    if r <= _ZERO and solid[16] <= _ZERO:  # a box
+    if r <= ZERO and solid[16] <= ZERO:  # a box
         x0, x1 = _slab(ox, dx, a)
         y0, y1 = _slab(oy, dy, solid[13])
         z0, z1 = _slab(oz, dz, c)
@@ -109,10 +107,10 @@ def _intersect(solid, ox, oy, oz, dx, dy, dz):
     square = dx * dx + dy * dy
     mixed = ox * dx + oy * dy
     offset = ox * ox + oy * oy - a * a
-    if solid[16] > _ZERO:
+    if solid[16] > ZERO:
         z0, z1 = _slab(oz, dz, c)
         if square < np.float32(1e-12):
-            return z0 if offset < _ZERO else _MISS
+            return z0 if offset < ZERO else _MISS
         enter = _quadratic(square, mixed, offset, False)
         leave = _quadratic(square, mixed, offset, True)
         enter = max(enter, z0)
@@ -168,9 +166,6 @@ def render_depth(solids, intrinsics, T, depth):
                     depth[v, u] = t
 
 
-_HALF = np.float32(0.5)
-
-
 @kernel()
 def fill_voxels(solids, low, voxel, margin, out):
     """Sets the voxels of out [nx ny nz] whose center is in a solid, or at most `margin` [m] from it.
@@ -181,29 +176,29 @@ def fill_voxels(solids, low, voxel, margin, out):
     for s in range(len(solids)):
         row = solids[s]
         reach = _radius(row) + margin
-        i0 = int(max((row[0] - reach - low[0]) / voxel, _ZERO))
+        i0 = int(max((row[0] - reach - low[0]) / voxel, ZERO))
         i1 = int((row[0] + reach - low[0]) / voxel + 1)
-        j0 = int(max((row[1] - reach - low[1]) / voxel, _ZERO))
+        j0 = int(max((row[1] - reach - low[1]) / voxel, ZERO))
         j1 = int((row[1] + reach - low[1]) / voxel + 1)
-        k0 = int(max((row[2] - reach - low[2]) / voxel, _ZERO))
+        k0 = int(max((row[2] - reach - low[2]) / voxel, ZERO))
         k1 = int((row[2] + reach - low[2]) / voxel + 1)
         square = (margin + row[15]) ** 2
         for i in range(i0, min(i1, nx)):
-            px = low[0] + (np.float32(i) + _HALF) * voxel - row[0]
+            px = low[0] + (np.float32(i) + HALF) * voxel - row[0]
             for j in range(j0, min(j1, ny)):
-                py = low[1] + (np.float32(j) + _HALF) * voxel - row[1]
+                py = low[1] + (np.float32(j) + HALF) * voxel - row[1]
                 for k in range(k0, min(k1, nz)):
-                    pz = low[2] + (np.float32(k) + _HALF) * voxel - row[2]
+                    pz = low[2] + (np.float32(k) + HALF) * voxel - row[2]
                     # how far the center is outside the half edges, along each axis of the solid
                     x = abs(row[3] * px + row[4] * py + row[5] * pz)
                     y = abs(row[6] * px + row[7] * py + row[8] * pz)
                     z = abs(row[9] * px + row[10] * py + row[11] * pz)
-                    if row[16] > _ZERO:
+                    if row[16] > ZERO:
                         x = np.sqrt(x * x + y * y)
-                        y = _ZERO
-                    x = max(x - row[12], _ZERO)
-                    y = max(y - row[13], _ZERO)
-                    z = max(z - row[14], _ZERO)
+                        y = ZERO
+                    x = max(x - row[12], ZERO)
+                    y = max(y - row[13], ZERO)
+                    z = max(z - row[14], ZERO)
                     if x * x + y * y + z * z <= square:
                         out[i, j, k] = True
 
@@ -253,7 +248,7 @@ def balls(spheres: Spheres) -> Float32[ndarray, "n 17"]:
     """Spheres (x, y, z, radius [m]) as rows of `SceneArrays.solids`."""
     rows = np.zeros((len(spheres), 17), np.float32)
     rows[:, [0, 1, 2, 15]] = spheres
-    rows[:, [3, 7, 11]] = _ONE
+    rows[:, [3, 7, 11]] = ONE
     return rows
 
 

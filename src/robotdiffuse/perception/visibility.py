@@ -12,7 +12,7 @@ from robotdiffuse.collision.exact_meshes import forward_frames
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.collision.kernels.collision_cost import frames_of
 from robotdiffuse.collision.kernels.collision_cost import placed as placed_point
-from robotdiffuse.core.kernels import kernel
+from robotdiffuse.core.kernels import HALF, ONE, ZERO, kernel
 from robotdiffuse.core.transforms import placed
 from robotdiffuse.core.types import Configuration, Configurations, Mask, Points, Values, Vector
 from robotdiffuse.perception.depth_view import Intrinsics
@@ -43,20 +43,18 @@ def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, 
     the grid [m]. edge: edge of a voxel [m].
     """
     fx, fy, cx, cy = intrinsics
-    half = np.float32(0.5)
-    one = np.float32(1.0)
     nx, ny, nz = filled.shape
     out = np.zeros(len(poses))
     frames = np.zeros((configurations.shape[1] + 1, 12), np.float32)
     arm = np.zeros((len(robot.spheres), 17), np.float32)
-    arm[:, 3:12:4] = one  # no rotation
+    arm[:, 3:12:4] = ONE  # no rotation
     # the depth of the arm's spheres in the middle of each cell of pixels
     arm_depth = np.empty((-(-size[0] // ARM_CELL), -(-size[1] // ARM_CELL)), np.float32)
     cells = intrinsics / np.float32(ARM_CELL)
-    cells[2:] -= half
+    cells[2:] -= HALF
     for c in range(len(poses)):
         T = poses[c]
-        _place(robot, configurations[c], half * edge, frames, arm)
+        _place(robot, configurations[c], HALF * edge, frames, arm)
         arm_depth[:] = np.inf
         render_depth(arm, cells, T, arm_depth)
         ox = (T[0, 3] - low[0]) / edge
@@ -64,28 +62,28 @@ def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, 
         oz = (T[2, 3] - low[2]) / edge
         for n in range(len(voxels)):
             # the voxel's center, and the vector from it to the camera, in edges of voxels
-            x = voxels[n, 0] + half
-            y = voxels[n, 1] + half
-            z = voxels[n, 2] + half
+            x = voxels[n, 0] + HALF
+            y = voxels[n, 1] + HALF
+            z = voxels[n, 2] + HALF
             dx = ox - x
             dy = oy - y
             dz = oz - z
             x_away, y_away, z_away = in_camera(T, dx, dy, dz)
             forward = -z_away
-            if forward <= one or forward * edge > reach:
+            if forward <= ONE or forward * edge > reach:
                 continue
             u = -fx * x_away / forward + cx
             v = -fy * y_away / forward + cy
-            if not (-half <= u < size[1] - half and -half <= v < size[0] - half):
+            if not (-HALF <= u < size[1] - HALF and -HALF <= v < size[0] - HALF):
                 continue
-            if arm_depth[int(v + half) // ARM_CELL, int(u + half) // ARM_CELL] < forward * edge:
+            if arm_depth[int(v + HALF) // ARM_CELL, int(u + HALF) // ARM_CELL] < forward * edge:
                 continue
             far = np.sqrt(dx * dx + dy * dy + dz * dz)
             dx = dx / far
             dy = dy / far
             dz = dz / far
             # walk from the voxel to the camera in steps of one voxel
-            visible = one
+            visible = ONE
             traveled = OCCLUSION_START
             while traveled < far and visible > MIN_VISIBILITY:
                 i = int(np.floor(x + traveled * dx))
@@ -93,8 +91,8 @@ def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, 
                 k = int(np.floor(z + traveled * dz))
                 if not (0 <= i < nx and 0 <= j < ny and 0 <= k < nz):
                     break
-                visible *= one - filled[i, j, k]
-                traveled += one
+                visible *= ONE - filled[i, j, k]
+                traveled += ONE
             out[c] += weights[n] * visible if visible > MIN_VISIBILITY else 0.0
     return out
 
@@ -141,8 +139,6 @@ def _place(robot, q, margin, frames, arm):
 
 MAX_LOST_FRACTION = 0.2
 """Largest fraction of a ball's pixels without a return."""
-_HALF = np.float32(0.5)
-_ZERO = np.float32(0.0)
 
 
 @kernel(nogil=True)
@@ -170,16 +166,16 @@ def see_through(depth, intrinsics, T, balls, radius, errors, border, seen):
         grown = radius + errors[0] + errors[1] * z
         near = z - grown
         far = z + grown
-        if near <= _ZERO:
+        if near <= ZERO:
             continue
         u0 = np.floor(fx * (x - grown) / (near if x < grown else far) + cx) - border
         u1 = np.ceil(fx * (x + grown) / (near if x > -grown else far) + cx) + border
         v0 = np.floor(fy * (y - grown) / (near if y < grown else far) + cy) - border
         v1 = np.ceil(fy * (y + grown) / (near if y > -grown else far) + cy) + border
-        if u0 < _ZERO or v0 < _ZERO or u1 > np.float32(w - 1) or v1 > np.float32(h - 1):
+        if u0 < ZERO or v0 < ZERO or u1 > np.float32(w - 1) or v1 > np.float32(h - 1):
             continue
         # at most MAX_DEPTH / 2: pixels with nothing in range have the depth MAX_DEPTH, behind every ball
-        min_return = min(far + errors[2] * far * far, MAX_DEPTH * _HALF)
+        min_return = min(far + errors[2] * far * far, MAX_DEPTH * HALF)
         seen[n] = _all_behind(usable, int(v0), int(v1), int(u0), int(u1), min_return)
 
 
@@ -194,7 +190,7 @@ def _all_behind(depth, v0, v1, u0, u1, min_return):
             if abs(depth[v, u]) > min_return:
                 continue
             lost += 1
-            if depth[v, u] > _ZERO or lost > max_lost:
+            if depth[v, u] > ZERO or lost > max_lost:
                 return False
     return True
 

@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.collision.kernels.collision_cost import frames_of, placed
-from robotdiffuse.core.kernels import kernel
+from robotdiffuse.core.kernels import HALF, ONE, kernel
 from robotdiffuse.core.types import Configuration, Mask, Path, Points, Spheres
 from robotdiffuse.robots.robot import Robot
 
@@ -187,11 +187,9 @@ def surface(marked: Voxels) -> Indices:
 @kernel(nogil=True)
 def _mark(x, y, z, radius, low, voxel, marked):
     nx, ny, nz = marked.shape
-    half = np.float32(0.5)
-    one = np.float32(1.0)
-    x = (x - low[0]) / voxel - half
-    y = (y - low[1]) / voxel - half
-    z = (z - low[2]) / voxel - half
+    x = (x - low[0]) / voxel - HALF
+    y = (y - low[1]) / voxel - HALF
+    z = (z - low[2]) / voxel - HALF
     r = radius / voxel
     for i in range(max(int(np.ceil(x - r)), 0), min(int(np.floor(x + r)), nx - 1) + 1):
         dx = np.float32(i) - x
@@ -202,7 +200,7 @@ def _mark(x, y, z, radius, low, voxel, marked):
                 continue
             reach = np.sqrt(square)
             first = max(int(np.ceil(z - reach)), 0)
-            beyond = min(int(np.floor(z + reach + one)), nz)
+            beyond = min(int(np.floor(z + reach + ONE)), nz)
             for k in range(first, beyond):
                 marked[i, j, k] = True
 

@@ -13,7 +13,7 @@ BUILD_TIME = b"pybullet build time"
 def _import_pybullet() -> None:
     """Import PyBullet, and suppress the build time that it prints directly to a file descriptor. Output of
     other threads during the import is printed afterwards."""
-    saved: dict[int, int] = {}
+    saved = dict[int, int]()
     for stream in (1, 2):
         with suppress(OSError):  # the stream is closed
             saved[stream] = os.dup(stream)

@@ -13,20 +13,20 @@ between two links, therefore has a contact here.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 from xml.etree import ElementTree as Xml
 
 import numpy as np
 import pybullet
 import trimesh
+from pybullet_utils.bullet_client import BulletClient
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.files import writing
-from robotdiffuse.core.settings import Bound, Positive, Settings
+from robotdiffuse.core.settings import Bound, Number, Positive, Settings
 from robotdiffuse.core.transforms import rpy_from_rotation, xyzw_of
 from robotdiffuse.core.types import (
     Configuration,
@@ -60,16 +60,6 @@ MIN_MASS = 0.01
 """Smallest mass of a link [kg]; PyBullet cannot move links without mass."""
 
 
-class _Simulation:
-    """A simulation, with PyBullet's functions as methods."""
-
-    def __init__(self) -> None:
-        self._client = pybullet.connect(pybullet.DIRECT)
-
-    def __getattr__(self, name: str) -> Any:
-        return partial(getattr(pybullet, name), physicsClientId=self._client)
-
-
 W = TypeVar("W", bound="World")
 
 
@@ -83,7 +73,7 @@ class World:
     def __init__(self, robot: Robot, scene: Scene, moving: Sequence[MovingObstacle] = ()) -> None:
         """moving: further obstacles, at their poses of time 0 until `move` is called."""
         self.robot = robot
-        self.bullet = _Simulation()
+        self.bullet = BulletClient(pybullet.DIRECT)
         """PyBullet's functions for this simulation."""
         self._folder = TemporaryDirectory()
         try:
@@ -105,7 +95,7 @@ class World:
         self.body: int = bullet.loadURDF(str(urdf), useFixedBase=True, flags=flags)
         self.links: dict[str, int] = {robot.base: -1}
         """PyBullet's index of each link, which is also the index of the joint that moves the link."""
-        indices: dict[str, int] = {}
+        indices = dict[str, int]()
         for index in range(bullet.getNumJoints(self.body)):
             info = bullet.getJointInfo(self.body, index)
             indices[info[1].decode()] = index
@@ -127,9 +117,9 @@ class World:
                 bullet.setCollisionFilterPair(self.body, self.body, self.links[a], self.links[b], 0)
         for index, value in self.held.items():
             bullet.resetJointState(self.body, index, value)
-        self.obstacles: dict[str, int] = {}
+        self.obstacles = dict[str, int]()
         """PyBullet's body index of each obstacle, by name."""
-        self.mesh_shapes: dict[tuple[bytes, bytes], int] = {}
+        self.mesh_shapes = dict[tuple[bytes, bytes], int]()
         """PyBullet's collision shape of each mesh, by its vertices and faces. Shapes are reused, because
         PyBullet never frees the memory of a mesh."""
 
@@ -338,7 +328,7 @@ class ReplaySettings(Settings, name="replay"):
     """Time step of the simulation [s]; the default is PyBullet's own."""
     force: Positive = 500.0
     """Largest motor torque [N m], or force [N] for a prismatic joint."""
-    gravity: Annotated[float, Bound()] = 9.81
+    gravity: Number = 9.81
     """Gravity along -z of the base [m/s^2]."""
 
 
@@ -435,7 +425,7 @@ def _simulate(
         bullet.setJointMotorControl2(
             body, index, pybullet.POSITION_CONTROL, targetPosition=value, force=settings.force
         )
-    contacts: dict[tuple[str, str], ReplayContact] = {}
+    contacts = dict[tuple[str, str], ReplayContact]()
     velocities = np.diff(reference, axis=0) / settings.time_step
     positions = np.empty_like(reference)
     positions[0] = reference[0]

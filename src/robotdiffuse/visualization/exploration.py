@@ -7,7 +7,7 @@ from collections import Counter
 from pathlib import Path as FilePath
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from numpy import ndarray
 from PIL import Image
 
@@ -16,7 +16,7 @@ from robotdiffuse.core.transforms import placed
 from robotdiffuse.core.types import Mask, Path, Points, Trajectory, frozen_dataclass
 from robotdiffuse.drawables import ASSUMED, OBSERVED, Color, Surface, drawables, painted
 from robotdiffuse.perception.seen_points import near_scene
-from robotdiffuse.perception.voxel_grid import MAP
+from robotdiffuse.perception.voxel_grid import MAP, Voxels
 from robotdiffuse.planning.exploration.simulated import RecordedExplorer, RecordedStep, RecordedView
 from robotdiffuse.planning.exploration.steps import DONE, LOOK
 from robotdiffuse.scenes.scene import Scene
@@ -68,7 +68,6 @@ LAYERS = (
     {"name": "Unknown", "color": UNKNOWN, "opacity": 0.28, "order": 20},
 )
 """Layers of voxels on the page; `order` is the order in which see-through layers are drawn."""
-Voxels = Bool[ndarray, "nx ny nz"]
 
 
 @frozen_dataclass

@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 from robotdiffuse.collision.exact_meshes import forward_frames
 from robotdiffuse.core.errors import InputError, check_type, joined
 from robotdiffuse.core.files import check_output, write_atomically
-from robotdiffuse.core.settings import Bound, Natural, NotNegative, Settings
+from robotdiffuse.core.settings import Bound, Natural, NotNegative, Number, Settings
 from robotdiffuse.core.transforms import ball_around
 from robotdiffuse.core.types import (
     Configuration,
@@ -368,7 +368,7 @@ class PictureSettings(Settings, name="picture"):
     height: Pixels = 800
     ghosts: Natural = 5
     """Number of see-through arms from the start towards the goal, and of later poses of moving obstacles."""
-    azimuth: Annotated[float, Bound()] | None = None
+    azimuth: Number | None = None
     """Azimuth of the camera, measured from the x axis of the base [rad]; None: where most of the motion is
     visible."""
     shell: NotNegative = 0.0

@@ -8,7 +8,7 @@ import io
 import json
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
@@ -23,6 +23,7 @@ from robotdiffuse.core.transforms import IDENTITY, inverse, moved_spheres, quate
 from robotdiffuse.core.types import (
     Configuration,
     Configurations,
+    Done,
     Path,
     PlanResult,
     Points,
@@ -32,6 +33,7 @@ from robotdiffuse.core.types import (
     Values,
     frozen_dataclass,
     interpolated,
+    unreported,
 )
 from robotdiffuse.drawables import (
     GOAL,
@@ -459,7 +461,7 @@ def write_gallery(
     entries: Sequence[GalleryEntry],
     file: str | FilePath,
     title: str,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Done = unreported,
 ) -> None:
     """Write a gallery of motions as a self-contained .html file.
 
@@ -476,8 +478,7 @@ def write_gallery(
             f'<button><img alt="" src="data:image/jpeg;base64,{_thumbnail(robot, entry)}">'
             f"<b>{html.escape(entry.title)}</b><span>{html.escape(entry.caption)}</span></button>"
         )
-        if progress is not None:
-            progress(i + 1, len(entries))
+        progress(i + 1, len(entries))
     # in JSON '<' occurs only in strings; escaped, it cannot end the script element
     data = json.dumps(_shared(replays)).replace("<", "\\u003c")
     parts = {"title": html.escape(title), "buttons": "".join(buttons), "replays": data}

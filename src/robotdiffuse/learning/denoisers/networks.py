@@ -361,7 +361,7 @@ class UNet(Denoiser):
         if self.padding:
             features = torch.cat([features, features[:, -1:].expand(-1, self.padding, -1)], 1)
         x = self.embed(features).float()
-        skips: list[Tensor] = []
+        skips = list[Tensor]()
         for blocks, halve in zip(self.down, self.halving, strict=True):
             x = _through(blocks, x, token)
             skips.append(x)

@@ -136,7 +136,7 @@ def load_data(
         turned_copies = 0
     parts: dict[str, list[_Part]] = {"train": [], "validation": []}
     encoder_fingerprint = "" if encoder is None else fingerprint(encoder)
-    fingerprints: list[str] = []
+    fingerprints = list[str]()
     count = 0
     shards = len(shard_indices(folder))
     for rows in read_rows(folder, robot, waypoints, turned_copies):

@@ -59,27 +59,28 @@ class SamplePrefetcher:
     def __init__(self, families: Sequence[str], robot: Robot, batch: int, workers: int) -> None:
         """batch: number of samples in a batch. workers: number of worker processes; 0: `next` draws the
         samples itself."""
-        self._families = tuple(families)
-        self._robot = robot
+        self._draw = partial(draw_samples, tuple(families), robot)
         self._batch = batch
         self._count, self._workers = workers, Workers(workers, partial(os.nice, NICENESS))
-        self._pending: dict[tuple[int, ...], Future[Samples]] = {}
+        self._pending = dict[tuple[int, ...], Future[Samples]]()
         """Batches that are being drawn, by their seeds."""
 
     def next(self, rng: Generator) -> Samples:
         """The batch of samples with the seeds that `rng` draws."""
         if not self._count:
-            return draw_samples(self._families, self._robot, self._seeds(rng))
+            return self._draw(self._seeds(rng))
         following = copy.deepcopy(rng)
         upcoming = [self._seeds(following) for _ in range(1 + BATCHES_AHEAD * self._count)]
-        self._pending = {seeds: self._pending.get(seeds) or self._submitted(seeds) for seeds in upcoming}
+        self._pending = {
+            seeds: self._pending.get(seeds) or self._workers.submit(self._draw, seeds) for seeds in upcoming
+        }
         seeds = self._seeds(rng)
         try:
             return self._pending[seeds].result()
         except NotStartedError:
             raise
         except EndedError:  # killed, perhaps by the SIGTERM after which the training stores a checkpoint
-            return draw_samples(self._families, self._robot, seeds)
+            return self._draw(seeds)
 
     def close(self) -> None:
         """Stop the workers."""
@@ -87,9 +88,6 @@ class SamplePrefetcher:
 
     def _seeds(self, rng: Generator) -> tuple[int, ...]:
         return tuple(rng.integers(SEED_LIMIT, size=self._batch).tolist())
-
-    def _submitted(self, seeds: tuple[int, ...]) -> "Future[Samples]":
-        return self._workers.submit(draw_samples, self._families, self._robot, seeds)
 
 
 BUNDLED_WEIGHTS = "bundled"
@@ -250,7 +248,7 @@ class CompletionTask(TrainingTask):
     def _predictions(self, samples: Samples) -> tuple[Floats, Flags, Flags]:
         """Logits and truth of the predicted fine voxels, and which of these are unknown and above the
         ground."""
-        predictions: list[tuple[ndarray, ndarray, ndarray]] = []
+        predictions = list[tuple[ndarray, ndarray, ndarray]]()
         for part in _split(samples):
             hidden = ((part.seen & OCCUPIED) == 0) & self._above
             with torch.no_grad():

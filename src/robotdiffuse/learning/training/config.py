@@ -27,7 +27,7 @@ from robotdiffuse.learning.denoisers import (
 )
 from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.encoders import ENCODERS, EncoderSettings
-from robotdiffuse.learning.motion_model import MAX_WAYPOINTS, ModelParts, check_points
+from robotdiffuse.learning.motion_model import ModelParts, Waypoints, check_points
 from robotdiffuse.learning.training.losses import LossSettings
 from robotdiffuse.learning.weight_files import NETWORKS
 
@@ -128,7 +128,7 @@ class MotionTraining(TrainingSettings):
     """Folder of a data set of `robotdiffuse data generate`."""
     robot: str = "panda"
     """Name of a bundled robot, or path to a URDF: the robot of the data."""
-    waypoints: Annotated[int, Bound(least=3.0, most=MAX_WAYPOINTS)] = 48
+    waypoints: Waypoints = 48
     """Number of waypoints of a trajectory (paper: 254)."""
     turned_copies: Natural = 5
     """Number of copies of each trajectory, turned about the vertical together with their scenes, if the axis

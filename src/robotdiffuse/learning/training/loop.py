@@ -246,8 +246,8 @@ class TrainingRun:
         self.rng = np.random.default_rng(seed)
         self.at = Position()
         self.identity = task.identity | ({} if processes.count == 1 else {"processes": str(processes.count)})
-        self.rows: list[dict[str, float | int | str]] = []
-        self._losses: list[float] = []
+        self.rows = list[dict[str, float | int | str]]()
+        self._losses = list[float]()
         self._file = self.out / "training.safetensors"
         if self._file.is_file():
             self._restore()
@@ -268,7 +268,7 @@ class TrainingRun:
         torch.set_num_threads(self.settings.threads)
         try:
             lock = lock_folder(self.out) if self.processes.first else nullcontext()
-            stopped_by: list[int] = []  # only noted, so that the current step is finished first
+            stopped_by = list[int]()  # only noted, so that the current step is finished first
             stopping = handled(lambda number, _: stopped_by.append(number), *STOPS)
             # Attention has weights below 1e-38, with which processors compute slowly: a step of config
             # `paper` took a third longer. The thread of the steps, and those that it starts, take them for 0.

@@ -117,7 +117,7 @@ class Page(LivePage):
         self._panel = Panel(self)
         self._obstacles = Obstacles(server, self.select)
         self._moving = Obstacles(server)
-        self._arms: dict[str, Arm] = {}
+        self._arms = dict[str, Arm]()
         self._frames: Float[ndarray, "n frames 4 4"] | None = None
         """T_base_frame of all frames along the shown motion, at POSE_RATE."""
         self._lock = threading.Lock()
@@ -350,7 +350,7 @@ class Panel:
         gui = self._server.gui
         self._selected: Any = gui.add_dropdown("Obstacle", (NO_OBSTACLE,), initial_value=NO_OBSTACLE)
         self._sizes_box = gui.add_folder("Size [m]", visible=False)
-        self._sizes: dict[str, Any] = {}
+        self._sizes = dict[str, Any]()
         self._delete = gui.add_button("Delete", icon=viser.Icon.TRASH, visible=False)
         new = gui.add_dropdown("New obstacle", tuple(NEW_OBSTACLES), initial_value="sphere")
         add = gui.add_button("Add", icon=viser.Icon.PLUS)
@@ -644,7 +644,7 @@ class Obstacles:
     def __init__(self, server: viser.ViserServer, clicked: Callable[[str], None] = lambda _: None) -> None:
         self._server = server
         self._clicked = clicked
-        self._nodes: dict[str, tuple[object, Any]] = {}
+        self._nodes = dict[str, tuple[object, Any]]()
 
     def show(self, obstacles: Sequence[Drawable], selected: str = "", time: float = 0.0) -> None:
         """Show obstacles at their poses at a time [s], and highlight the selected obstacle."""

@@ -142,7 +142,7 @@ class Session:
         self._lock = threading.RLock()
         self.state = _opened(problem, options)
         """The current state."""
-        self._planners: dict[str, Planner] = {}
+        self._planners = dict[str, Planner]()
         self._planning_task = LatestTask(self._plan, "plan")
         self._validation_task = LatestTask(self._validate, "validate")
         self._goal_task = LatestTask(self._find_goal_configuration, "aim")
@@ -498,7 +498,7 @@ def uploaded_problem(content: bytes, name: str, robot: Robot) -> Problem:
         raise InputError(f"{name} has {len(content)} bytes; at most {MAX_UPLOAD_SIZE} are read")
     text = decoded(content, name)
     data = parse_json(text, name) if name.lower().endswith(".json") else parse_yaml(text, name)
-    robots: dict[Any, Robot] = {}
+    robots = dict[Any, Robot]()
     try:
         if isinstance(data, dict) and "robot" in data:
             named_robot = data["robot"]
@@ -566,7 +566,7 @@ class Changes:
     """Remembers the values that were last shown, by name, to find changes."""
 
     def __init__(self) -> None:
-        self._shown: dict[str, tuple[object, ...]] = {}
+        self._shown = dict[str, tuple[object, ...]]()
 
     def new(self, what: str, *values: object) -> bool:
         """Whether values differ from the last values with the name `what`; remembers them. Floats, texts
