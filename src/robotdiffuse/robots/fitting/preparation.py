@@ -412,9 +412,9 @@ def _with_tables(
 
 
 def _beyond_spheres(robot: Robot, pair: PairFalseCollisions, settings: PreparationSettings, k: int) -> bool:
-    """Whether a table should replace the spheres of a pair. For this, one or two joints must be between the
-    links. In addition, even the finest spheres would collide falsely too often, or, after an earlier
-    refinement (`k` > 0), the present spheres do."""
+    """Whether a table should replace the spheres of a pair: if one or two joints are between the links, and
+    even the finest spheres would collide falsely too often or, after an earlier refinement (`k` > 0), the
+    present spheres do."""
     narrow_fraction = (pair.gaps < 2 * settings.finest).mean() if len(pair.gaps) else 0.0
     if k:
         narrow_fraction = 1.0
@@ -424,7 +424,7 @@ def _beyond_spheres(robot: Robot, pair: PairFalseCollisions, settings: Preparati
 
 
 def _shared(pair: PairFalseCollisions, link: str) -> Spheres:
-    """Rows x, y, z, w of places on one of two links: the link's share of the gap there is w / 2 [m]. So the
+    """Rows x, y, z, w of places on one of two links; w is twice the link's share of the gap there [m], so the
     mean of w over the two links is the gap.
 
     Covering an area A takes about A / t spheres that stick out by t. Together the two links need the fewest
