@@ -96,8 +96,8 @@ class DataFigures:
 
     @property
     def safety_distance(self) -> float:
-        """The safety distance that data generation tries first [m]. Searches that fail lower it, so it is the
-        largest one in the data."""
+        """The safety distance that data generation tries first [m]. After a failed search, a smaller one is
+        tried, so the first one is the largest in the data."""
         return float(self.all["safety_distance"].max())
 
 

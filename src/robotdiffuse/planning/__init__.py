@@ -1,4 +1,4 @@
-"""The planners by name. A new planner is one file and one line in PLANNERS."""
+"""The planners by name. A new planner is one file and one entry in PLANNERS."""
 
 import inspect
 import re

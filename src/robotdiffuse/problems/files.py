@@ -93,9 +93,9 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
         The problem, with its robot loaded.
 
     Raises:
-        InputError: For a file that cannot be read and a wrong index; and, with one line that names the file
-            and the field, for unknown or missing fields and shapes, values of the wrong type, and what
-            `rd.Problem` does not accept.
+        InputError: For a file that cannot be read and a wrong index. Also for unknown or missing fields and
+            shapes, values of the wrong type, and what `rd.Problem` does not accept; the message is then a
+            line that names the file and the field.
 
     Examples:
         >>> rd.load_problem("examples/ball.yaml").scene
@@ -153,8 +153,8 @@ def problem_record(
 ) -> dict[str, object]:
     """Convert a problem to JSON values.
 
-    Numbers are kept exactly, except that the poses of base and tool and, with a base, all numbers of fields
-    in the frame of the world have 15 decimals.
+    Numbers are kept exactly, except for two kinds, which are rounded to 15 decimals: the poses of base and
+    tool; and, if the problem has a base, all fields in the frame of the world.
 
     Args:
         problem: The problem.
@@ -459,7 +459,7 @@ def held_out_problem(family: str, number: int) -> Problem:
     # the seeds of the published problems
     rng = np.random.default_rng([SEED, number] if index == 0 else [SEED, 10 + index, number])
     if index > 1:
-        rng.random()  # the generator of the published problems drew one number more
+        rng.random()  # the code that made the published problems drew one number more
     robot = load_robot("panda")
     return load_family(family).draw(robot, rng).problem(robot)
 

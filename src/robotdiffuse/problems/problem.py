@@ -231,7 +231,7 @@ def poses_of(goal: Goal) -> Sequence[PoseGoal]:
 
 
 LIMIT_SLACK = 1e-3
-"""A joint value up to this far beyond a limit is clamped to the limit, with a note [rad] or [m]."""
+"""A joint value beyond a limit by up to this much [rad] or [m] is clamped to the limit, with a note."""
 VELOCITY_SLACK = 1e-6
 """A start velocity beyond a limit by up to this fraction of the limit is clamped to the limit, with a note:
 float32 rounds by up to 6e-8."""
@@ -280,7 +280,7 @@ def blend_radii(value: object, count: int) -> tuple[float, ...]:
         blends = np.full(count, blends)
     has_blends = blends is None or blends.size > 0
     if has_blends and not count:
-        raise InputError(f"blend is {shown(value)}; there are no waypoints: leave out blend, or give some")
+        raise InputError(f"blend is {shown(value)}; there are no waypoints: leave out blend, or add some")
     if (
         blends is None
         or (has_blends and blends.shape != (count,))
@@ -325,7 +325,7 @@ def velocity_at_start(robot: Robot, value: object, notes: list[str]) -> JointVal
             f"[rad/s] or [m/s]: {names}"
         )
     within = np.clip(velocity, -robot.velocity, robot.velocity)
-    for j in np.flatnonzero((velocity != within) & (robot.velocity > 0)):
+    for j in np.flatnonzero((velocity != within) & (robot.velocity > 0)):  # 0: no limit
         name = robot.joint_names[j]
         limit = robot.velocity[j]
         if abs(velocity[j] - within[j]) > VELOCITY_SLACK * limit:
@@ -687,7 +687,7 @@ class Problem(Value):
         rows = configurations(self.robot, q)
         checker = CollisionChecker(self.robot, self.scene)
         pairs = checker.robot_arrays.pairs.copy()
-        pairs[:, 2] = -1  # tables of pairs tell no distances
+        pairs[:, 2] = -1  # no tables: they tell whether links touch, but not their distance
         checker.robot_arrays = checker.robot_arrays._replace(pairs=pairs)
         batch = np.atleast_2d(rows)
         each = np.hstack([checker.link_clearances(batch), checker.pair_clearances(batch)])

@@ -35,8 +35,8 @@ def random_scenes(count: int, max_obstacles: int, rng: Generator, rop: bool = Fa
     """Random scenes for training an encoder.
 
     Each scene is of one of three kinds, with equal probability: two large obstacles as in ROP; up to
-    `max_obstacles` obstacles with the sizes of dense ROP; or up to `max_obstacles` boxes and spheres of very
-    different sizes, half of them turned. rop: only scenes of the first kind.
+    `max_obstacles` obstacles about as large as in dense ROP; or up to `max_obstacles` boxes and spheres of
+    very different sizes, half of them turned. rop: only scenes of the first kind.
     """
     group = rng.integers(0, 1 if rop else 3, count)  # of each scene
     number = np.where(group == 0, 2, rng.integers(0, max_obstacles + 1, count))
