@@ -291,11 +291,13 @@ def _evaluate(
 
 
 NOTES = (
-    "single: share of samples that pass the validator; best: share of problems with at least one valid "
-    "sample.",
-    "length: mean length of the shortest valid sample, over the problems that have one; to first: mean ratio "
-    "of this length to the length in the first row, over the problems that both rows solve. Intervals are "
-    "over problems, not over training runs: another seed may change a row by more.",
+    "single: share of samples that pass the validator; unguided: the same without guidance; best: share of "
+    "problems with at least one valid sample. CPU: median time of encoding and sampling for one problem. "
+    "paper: its success [%], collision [%], length and time [s].",
+    "length: path lengths of the moving links added up, for the shortest valid sample; mean over the "
+    "problems that have one; to first: mean ratio of this length to the length in the first row, over the "
+    "problems that both rows solve. Intervals are over problems, not over training runs: another seed may "
+    "change a row by more.",
     "no network: motions through fixed configurations, without guidance; the nearest motions of the data, "
     "bent to start and goal; smooth noise, which networks start from. Nearest motions and smooth noise get "
     f"{EQUAL_TIME_STEPS} gradient steps, which take as long as a network. Problems that the straight line "
@@ -303,9 +305,9 @@ NOTES = (
 )
 LINE_FAMILIES = {"spheres and cubes": ROP, "spheres alone": Rop(kinds=("sphere",))}
 LINE_NOTES = (
-    "Share of problems on which the straight line in joint space is free. Problems are sampled as by the "
-    "authors, with inverse kinematics of the position only. The paper's rows include problems that the line "
-    "solves, so a success rate near these shares does not show that a planner avoids obstacles.",
+    "Share of problems on which the straight line in joint space is free; obstacles are spheres and cubes, "
+    "or spheres alone. Problems are sampled as by the authors, with inverse kinematics of the position only. "
+    "The paper's rows include problems that the line solves, so a success rate near these shares does not show that a planner avoids obstacles.",
 )
 
 

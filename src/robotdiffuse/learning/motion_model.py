@@ -470,8 +470,8 @@ def _carriers(checker: CollisionChecker) -> tuple[int, list[int]]:
     """The number of the checker's links that belong to the bare arm, and the carrier of each attached body.
     Attached bodies follow the arm's links in `checker.links`.
 
-    The carrier is the index of the arm's link to which the body is fixed. If that link has no clearance, the
-    carrier is the last of the arm's links whose frame number is at most that of the body's frame.
+    The carrier is the index of the arm's link to which the body is fixed. If `checker.links` lacks that link,
+    the carrier is the last of the arm's links whose frame number is at most that of the body's frame.
     """
     robot = checker.robot
     arm = [link for link in checker.links if link in robot.arm.link_names]

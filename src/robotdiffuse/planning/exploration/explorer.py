@@ -467,13 +467,13 @@ class Explorer:
         predicted: Probabilities | None,
         motion: PlanResult,
     ) -> Step:
-        """The step if the search for a motion under the policy failed.
+        """The step if `_go` refused what the search for a motion under the policy returned.
 
         GO if a tentative motion keeps to the policy. If not, LOOK: at the unseen space that this motion
         sweeps, or from farther back on the way in. STUCK, with the reason, if no such view can be taken.
 
-        motion: what the search returned: a motion to the goal that does not keep to the policy, or a failed
-        result.
+        motion: what the search returned: a failed result, or a motion to the goal that does not keep to the
+        policy or whose goal must be seen first.
         """
         why = self._goal_seen.missing(motion) or motion.reason
         if motion.solved and policy == PROBABILISTIC:
@@ -675,7 +675,7 @@ class Explorer:
         """The unknown voxels of the map, except voxels that the arm fills at the configurations `ends`."""
         lost = None
         if predicted is None:
-            # regions on rays without a return; a confidence without a prediction depends on them
+            # regions on rays without a return; without a prediction, the planner's confidence depends on them
             lost = np.pad(lost_regions(self._views.volume()), ((0, 0), (0, 0), (LAYERS_BELOW, 0)))
         return UnknownSpace(self.robot, ends, self.map.unknown, predicted, 0.0, MAP, lost)
 
