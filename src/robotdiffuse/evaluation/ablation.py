@@ -307,7 +307,8 @@ LINE_FAMILIES = {"spheres and cubes": ROP, "spheres alone": Rop(kinds=("sphere",
 LINE_NOTES = (
     "Share of problems on which the straight line in joint space is free; obstacles are spheres and cubes, "
     "or spheres alone. Problems are sampled as by the authors, with inverse kinematics of the position only. "
-    "The paper's rows include problems that the line solves, so a success rate near these shares does not show that a planner avoids obstacles.",
+    "The paper's rows include problems that the line solves, so a success rate near these shares does not "
+    "show that a planner avoids obstacles.",
 )
 
 
