@@ -11,7 +11,6 @@ The geometry is the checker's own: distances of points to obstacles, and support
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -24,6 +23,7 @@ from robotdiffuse.certificates.kinematics import Linkage, Postures
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import ball_around, placed_each, rotation_from_quaternion
 from robotdiffuse.core.types import (
+    NO_SPHERES,
     Configurations,
     JointRows,
     JointValues,
@@ -31,6 +31,7 @@ from robotdiffuse.core.types import (
     Pose,
     Poses,
     Rotation,
+    Spheres,
     Values,
     Vector,
     frozen_dataclass,
@@ -90,7 +91,7 @@ class Surface:
         from scipy.spatial import KDTree  # imported here: it would double the import time of the checker
 
         middles = self.corners.mean(axis=1)
-        sizes = np.sqrt(((self.corners - middles[:, None]) ** 2).sum(axis=-1)).max(axis=1)
+        sizes = np.linalg.norm(self.corners - middles[:, None], axis=-1).max(axis=1)
         octaves = np.ceil(np.log2(np.maximum(sizes, 1e-6))).astype(int)
         members = [np.flatnonzero(octaves == octave) for octave in np.unique(octaves)]
         return [(KDTree(middles[rows]), rows, float(sizes[rows].max())) for rows in members]
@@ -200,7 +201,7 @@ def _to_triangles(p: Points, triangles: Float[ndarray, "n 3 3"]) -> Values:
     to the nearest edge."""
     a, b, c = np.moveaxis(triangles, 1, 0)
     normal = np.cross(b - a, c - a)
-    normal_length = np.sqrt((normal**2).sum(axis=1))
+    normal_length = np.linalg.norm(normal, axis=1)
     within = normal_length > 0
     distance = np.full(len(p), np.inf)
     for start, stop in ((a, b), (b, c), (c, a)):
@@ -209,7 +210,7 @@ def _to_triangles(p: Points, triangles: Float[ndarray, "n 3 3"]) -> Values:
         within &= (np.cross(edge, out) * normal).sum(axis=1) >= 0
         length2 = np.maximum((edge**2).sum(axis=1), 1e-300)
         share = np.clip((edge * out).sum(axis=1) / length2, 0.0, 1.0)
-        distance = np.minimum(distance, np.sqrt(((out - share[:, None] * edge) ** 2).sum(axis=1)))
+        distance = np.minimum(distance, np.linalg.norm(out - share[:, None] * edge, axis=1))
     height = np.abs(((p - a) * normal).sum(axis=1)) / np.where(normal_length > 0, normal_length, 1.0)
     return np.where(within, np.minimum(height, distance), distance)
 
@@ -275,8 +276,7 @@ class Part(NamedTuple):
         return (self.vertices @ n.T).max(axis=0) + self.rounding
 
 
-@dataclass(frozen=True)
-class Bounds:
+class Bounds(NamedTuple):
     """Bounds of clearance and displacement for each of several stretches; see the docstring of the module."""
 
     clearance: Values
@@ -321,7 +321,7 @@ class Prover:
         ).reshape(len(links), len(self.obstacles.names))
         """[links, obstacles]: whether contact is allowed; such pairs are not checked."""
         balls = [_balls(robot, link) for link in links]
-        self._balls = np.concatenate([np.zeros((0, 4)), *balls])
+        self._balls = np.concatenate([NO_SPHERES, *balls])
         self._first = np.cumsum([0, *map(len, balls)])
 
     def _links_of(self, claim: Claim) -> tuple[int, int]:
@@ -468,7 +468,7 @@ class Prover:
             some = slice(first, first + step)
             row, ball, begin = self._expand(link[some])
             other_centers = placed_each(postures.T[at[some][row], link[some][row]], self._balls[ball, :3])
-            gaps = np.sqrt(((centers[some][row] - other_centers) ** 2).sum(axis=1)) - self._balls[ball, 3]
+            gaps = np.linalg.norm(centers[some][row] - other_centers, axis=1) - self._balls[ball, 3]
             distances[some] = np.minimum.reduceat(gaps, begin)
         return distances
 
@@ -505,7 +505,7 @@ class Prover:
                 if (p, o) not in normals:
                     continue
                 n = np.array(normals[p, o])
-                n /= np.sqrt((n**2).sum(axis=1, keepdims=True))
+                n /= np.linalg.norm(n, axis=1, keepdims=True)
                 approach = self.linkage.approach(*axes, part.vertices, mine, steps, n, off)
                 other_rise = np.zeros(len(n))
                 if isinstance(body, Part):
@@ -540,7 +540,7 @@ class Prover:
             else:
                 between = part.center - np.array([body.center for body in bodies])
                 radii = np.array([body.radius for body in bodies])
-                yield part, bodies, np.sqrt((between**2).sum(axis=1)) - part.radius - radii
+                yield part, bodies, np.linalg.norm(between, axis=1) - part.radius - radii
 
 
 def _steps(prover: Prover, start: float, stop: float) -> JointRows:
@@ -574,9 +574,9 @@ def placed(parts: tuple[Part, ...], T: Pose) -> list[Part]:
     return [part._replace(vertices=part.vertices @ R.T + t, center=R @ part.center + t) for part in parts]
 
 
-def _balls(robot: Robot, link: str) -> Float[ndarray, "n 4"]:
+def _balls(robot: Robot, link: str) -> Spheres:
     """The spheres that cover a link; if it has no spheres, one sphere around its meshes."""
-    spheres = robot.spheres.get(link, np.zeros((0, 4)))
+    spheres = robot.spheres.get(link, NO_SPHERES)
     meshes = robot.meshes.get(link)
     if len(spheres) or not meshes:
         return spheres

@@ -83,7 +83,7 @@ class Linkage:
             link = above[link].parent
         return chain[::-1]
 
-    def levers(self, link: str, q: Configurations) -> Float[ndarray, "joints"]:
+    def levers(self, link: str, q: Configurations) -> Values:
         """Upper bounds on the distance of a link's origin from the axis of each planned joint that moves it,
         base first [m]; 1 for a prismatic joint. q: rows that contain the extreme position of each joint."""
         bounds = list[float]()
@@ -133,7 +133,7 @@ class Linkage:
             arm = 1.0
             if not self.slides[j]:
                 across = np.cross(centers - postures.origins[rows, j], postures.axes[rows, j])
-                arm = np.sqrt((across**2).sum(axis=1)) + radii + went
+                arm = np.linalg.norm(across, axis=1) + radii + went
             went += np.where(moved[:, j], spans[rows, j] * arm, 0.0)
         return went
 
@@ -162,7 +162,7 @@ class Linkage:
         spans = np.abs(steps).max(axis=0) + off
         rates = np.cross(axes[moving_joints, None], points[None] - origins[moving_joints, None])
         rates[self.slides[moving_joints]] = axes[moving_joints, None][self.slides[moving_joints]]
-        lengths = np.sqrt((rates**2).sum(axis=2))
+        lengths = np.linalg.norm(rates, axis=2)
         along = np.moveaxis(rates @ normals.T, 2, 1)
         towards = np.tensordot(off[moving_joints], np.abs(along), 1)
         towards -= np.tensordot(steps[:, moving_joints], along, 1).min(axis=0)

@@ -122,7 +122,7 @@ def _around(first: _Body, part: Part, surface: Surface, needed: float) -> Iterat
     """Normals of planes that separate the elements of a surface from a part, by `needed` [m] where possible;
     elements with corners nearest to the part's center come first. Ends early if one touches the part."""
     shown_gaps = np.full(len(surface.corners), -np.inf)
-    order = np.argsort(np.sqrt(((surface.corners - part.center) ** 2).sum(axis=-1)).min(axis=1))
+    order = np.argsort(np.linalg.norm(surface.corners - part.center, axis=-1).min(axis=1))
     tried_elements = np.zeros(len(order), bool)
     for _ in range(MAX_PLANES):
         open_elements = order[(shown_gaps[order] < needed) & ~tried_elements[order]]

@@ -121,7 +121,7 @@ PLANNING = (
         "explore",
         "explore an unknown scene with a simulated wrist camera",
         "Simulate an arm that goes from a problem's start to its goal and knows of the scene only what depth "
-        "cameras have seen: one at its tip, and one beside the arm, for one image. Shapes named floor are "
+        "cameras have seen: one at its tip and, for one image, one beside the arm. Shapes named floor are "
         "known. Each motion is validated in the true scene. Exit status: 0 at the goal, 1 not, 2 bad input.",
         "explore:run_explore",
         (

@@ -10,12 +10,11 @@ from robotdiffuse.collision.kernels.collision_cost import clearances_and_gradien
 from robotdiffuse.collision.kernels.frames import write_rotation
 from robotdiffuse.collision.kernels.lane_clearance import make_clearance_workspace
 from robotdiffuse.collision.kernels.simd import W
-from robotdiffuse.core.kernels import inner_kernel, kernel
+from robotdiffuse.core.kernels import ONE, inner_kernel, kernel
 from robotdiffuse.scenes.packed_scenes import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 
-_ONE = np.float32(1.0)
 _NO_BOX_CORNER = np.float32(EMPTY_BOX[0, 0])
 
 
@@ -35,7 +34,7 @@ def _scene(empty, floors, floor, kinds, params, solids, around):
         solid[3:] = np.float32(0.0)
         solid[:3] = p[:3]
         if kind == SPHERE:
-            solid[3] = solid[7] = solid[11] = _ONE
+            solid[3] = solid[7] = solid[11] = ONE
             solid[15] = p[3]
         else:
             solid[12:15] = p[3:6] * np.float32(0.5)
@@ -52,7 +51,7 @@ def _scene(empty, floors, floor, kinds, params, solids, around):
             extent = solid[15]
             for j in range(3):
                 extent += abs(solid[3 + 3 * j + i]) * solid[12 + j]
-            extent += np.float32(BOX_SLACK) * (_ONE + abs(solid[i]) + extent)
+            extent += np.float32(BOX_SLACK) * (ONE + abs(solid[i]) + extent)
             around[k // W, i * W + k % W] = solid[i] - extent
             around[k // W, (3 + i) * W + k % W] = solid[i] + extent
     return SceneArrays(

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Int
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.convex_bounds import Hulls, Solids
-from robotdiffuse.core.transforms import ball_around, placed, transform
-from robotdiffuse.core.types import Points, Pose, Vector
+from robotdiffuse.core.transforms import ball_around, box_around, placed, transform
+from robotdiffuse.core.types import NO_SPHERES, Points, Pose, Vector
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot, pairs_to_check
 from robotdiffuse.scenes.scene import Scene
@@ -67,16 +67,16 @@ class Solid(NamedTuple):
 @once_per_robot
 def parts_of(robot: Robot) -> dict[str, tuple[Part, ...]]:
     """Convex parts of every link that has geometry."""
-    parts: dict[str, tuple[Part, ...]] = {}
+    parts = dict[str, tuple[Part, ...]]()
     for link in robot.link_names:
         frame = robot.link_frame(link)
         T = robot.T_frame_link(link)
-        convex_parts: list[Part] = []
+        convex_parts = list[Part]()
         for mesh in robot.meshes.get(link, ()):
             vertices = placed(T, mesh.vertices)
             convex_parts.append(Part(frame, vertices, mesh.faces, 0.0, *ball_around(vertices)))
         if not convex_parts:
-            for x, y, z, radius in robot.spheres.get(link, np.zeros((0, 4))).tolist():
+            for x, y, z, radius in robot.spheres.get(link, NO_SPHERES).tolist():
                 center = T[:3, :3] @ np.array([x, y, z]) + T[:3, 3]
                 convex_parts.append(Part(frame, center[None], np.zeros((0, 3), int), radius, center, radius))
         if convex_parts:
@@ -161,8 +161,7 @@ def _solid(shape: Shape) -> Solid | None:
 
 
 def _bounded(shape: Shape, points: Points, inflation: float) -> Solid:
-    low = points.min(axis=0)
-    high = points.max(axis=0)
+    low, high = box_around(points)
     return Solid(shape, transform((low + high) / 2), (high - low) / 2, 0.0, inflation, True)
 
 

@@ -14,7 +14,6 @@ touching the surface.
 # pyright: reportAttributeAccessIssue=false
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -38,7 +37,16 @@ from robotdiffuse.collision.convex_geometry import (
 from robotdiffuse.collision.kernels import mesh_bounds as kernel
 from robotdiffuse.core.deadline import check_time
 from robotdiffuse.core.transforms import placed, seen_from, transform
-from robotdiffuse.core.types import Configuration, Pose, Vector, for_kernels, frozen_dataclass
+from robotdiffuse.core.types import (
+    Configuration,
+    Points,
+    Pose,
+    Poses,
+    Spheres,
+    Vector,
+    for_kernels,
+    frozen_dataclass,
+)
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose, coal_rounded, coal_surface
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
@@ -61,7 +69,7 @@ class _Body:
     triangles: Float[ndarray, "f 3 3"]
     component: Int[ndarray, "f"]
     """Connected component of each triangle."""
-    points: Float[ndarray, "components 3"]
+    points: Points
     """One point of each component."""
 
     def inside(self, points: Float[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
@@ -94,7 +102,7 @@ class SurfacePair:
     first: _Body
     second: _Body
 
-    def distance(self, frames: Float[ndarray, "frames 4 4"], cutoff: float = np.inf) -> float | None:
+    def distance(self, frames: Poses, cutoff: float = np.inf) -> float | None:
         """Distance of the surfaces [m]; if the distance is larger than `cutoff`, some value of at least
         `cutoff`. None if the surfaces touch, or a component of one is inside the other."""
         a = self.first
@@ -116,7 +124,7 @@ class SurfacePair:
 @once_per_robot
 def surface_pairs(robot: Robot) -> dict[Check, SurfacePair]:
     """The surfaces of each checked pair of grazing links."""
-    bodies: dict[str, _Body] = {}
+    bodies = dict[str, _Body]()
     surfaces = {}
     for check in checks_of(robot):
         if check.other is None or frozenset(check) not in robot.grazing:
@@ -218,7 +226,7 @@ def _pieces(robot: Robot) -> dict[str, tuple[_Piece, ...]]:
     return {link: tuple(map(_piece, parts)) for link, parts in parts_of(robot).items()}
 
 
-def _balls(robot: Robot, link: str) -> tuple[int, Float[ndarray, "k 4"]]:
+def _balls(robot: Robot, link: str) -> tuple[int, Spheres]:
     """The frame of a link, and balls around its parts."""
     hulls, parts = hulls_of(robot)
     return robot.link_frame(link), hulls.balls[parts[link].start : parts[link].stop]
@@ -259,8 +267,7 @@ def _obstacles(scene: Scene) -> tuple[_Obstacle, ...]:
     return tuple(map(_obstacle, solids_of(scene)))
 
 
-@dataclass(frozen=True)
-class _Candidates:
+class _Candidates(NamedTuple):
     """The pairs of geometries that a check compares: each of `firsts`, the convex parts of a link, with each
     of `seconds`, obstacles or the convex parts of another link."""
 

@@ -22,7 +22,7 @@ from robotdiffuse.collision.point_cloud_grid import (
 )
 from robotdiffuse.collision.sphere_pair_tables import NO_TABLES, build_pair_tables
 from robotdiffuse.core.deadline import check_time
-from robotdiffuse.core.transforms import moved_spheres, transform
+from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.motion_bounds import radii_of
 from robotdiffuse.robots.robot import LinkPairTable, Robot
@@ -182,7 +182,7 @@ def _placed_groups(robot: Robot) -> dict[str, _Group]:
     link_spheres = []
     parts = []  # the rows of each link
     for link in links:
-        link_spheres.append(moved_spheres(robot.T_frame_link(link), robot.spheres[link]))
+        link_spheres.append(robot.frame_spheres(link))
         parts.append(_clusters(link_spheres[-1]))
     bounds = bounding_spheres([*link_spheres, *(part for group in parts for part in group)])
     # the bounds of the links come first, then those of all their rows

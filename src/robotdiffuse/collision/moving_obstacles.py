@@ -25,8 +25,8 @@ from robotdiffuse.collision.kernels import moving_obstacles as kernel
 from robotdiffuse.collision.kernels.moving_obstacles import CLEARANCE_CAP, Links, Tasks, Tracks
 from robotdiffuse.collision.motions import with_covering_spheres
 from robotdiffuse.core.loading import loading
-from robotdiffuse.core.transforms import inverse, moved_spheres, quaternion_from_rotation
-from robotdiffuse.core.types import Values, for_kernels, interpolated
+from robotdiffuse.core.transforms import inverse, quaternion_from_rotation
+from robotdiffuse.core.types import NO_SPHERES, Values, for_kernels, interpolated
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.motion_bounds import radii_of
 from robotdiffuse.robots.robot import Robot
@@ -114,7 +114,7 @@ class MovingCollision:
             return TimedSweep(self._contact(times, q, *hit), 0.0)
         return TimedSweep(None, float(certified))
 
-    def inflated(self, by: Float[ndarray, "obstacles"]) -> "MovingCollision":
+    def inflated(self, by: Values) -> "MovingCollision":
         """A copy for `first_unproved_time`, with each obstacle inflated by its entry of `by` [m]. Only bounds
         from the covering spheres use the inflation; distances of the exact meshes do not."""
         inflated = copy(self)
@@ -183,13 +183,13 @@ def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
     """Names of the moving links with geometry, and the links' arrays for compiled code."""
     covered = with_covering_spheres(robot)
     names = tuple(link for link in robot_groups(covered) if covered.link_frame(link) > 0)
-    spheres = [moved_spheres(covered.T_frame_link(link), covered.spheres[link]) for link in names]
+    spheres = list(map(covered.frame_spheres, names))
     links = Links(
         *robot.kernel_joints,
         np.array([covered.link_frame(link) for link in names], np.int64),
         np.array(bounding_spheres(spheres)).reshape(-1, 4),
         np.cumsum([0, *map(len, spheres)]),
-        np.concatenate(spheres) if spheres else np.zeros((0, 4)),
+        np.concatenate(spheres) if spheres else NO_SPHERES,
         radii_of(covered, names),
     )
     return names, links
@@ -198,7 +198,7 @@ def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
 def compile_tracks(moving: Sequence[MovingObstacle]) -> Tracks:
     """The arrays of moving obstacles for compiled code. A mesh is represented by its bounding box."""
     # times, positions, quaternions and speeds: an empty entry, in case there is no obstacle, then one of each
-    tracks = [(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0))]
+    tracks = [(np.zeros(0), np.zeros((0, 3)), NO_SPHERES, np.zeros(0))]
     solids = list[Solid]()
     for obstacle in moving:
         at, poses = obstacle.track

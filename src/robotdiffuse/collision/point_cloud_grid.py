@@ -2,13 +2,14 @@
 `kernels/point_grid.py` queries."""
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.point_grid import POINT_RANGE, make_grid
 from robotdiffuse.collision.kernels.simd import by_sixteen
 from robotdiffuse.core.transforms import scaled_normals
-from robotdiffuse.robots.fitting.triangles import split
+from robotdiffuse.core.types import NO_SPHERES, Points, Spheres
+from robotdiffuse.robots.fitting.triangles import Triangles, split
+from robotdiffuse.scenes.point_cloud import grouped
 
 MESH_SPACING = 0.02
 """Triangles of mesh obstacles are divided until no edge is longer than this [m]; each piece is covered by one
@@ -30,10 +31,9 @@ VOXELS_PER_RANGE = 10
 voxels."""
 MAX_VOXELS = 1e6
 """Approximate largest number of voxels of a grid: 4 MB, which fits a processor's cache."""
-NO_SPHERES = np.zeros((0, 4))
 
 
-def thin_points(points: Float[ndarray, "n 3"], radius: float, reach: float) -> Float[ndarray, "m 4"]:
+def thin_points(points: Points, radius: float, reach: float) -> Spheres:
     """One sphere per occupied voxel, large enough to contain the spheres of all the voxel's points [m].
 
     Points more than POINT_RANGE beyond `reach` [m] are left out.
@@ -43,22 +43,17 @@ def thin_points(points: Float[ndarray, "n 3"], radius: float, reach: float) -> F
     return _join(np.column_stack([points, np.full(len(points), radius)]), THINNING * radius)
 
 
-def _join(spheres: Float[ndarray, "n 4"], voxel: float) -> Float[ndarray, "m 4"]:
+def _join(spheres: Spheres, voxel: float) -> Spheres:
     """One sphere per occupied voxel: it contains all spheres with centers in the voxel."""
     if not len(spheres):
         return NO_SPHERES
     offsets = spheres[:, :3] - spheres[:, :3].min(axis=0)
-    # Three voxel indices and the sphere's index are packed into one integer per sphere: sorting these
-    # integers is faster than argsort.
-    index_bits = len(spheres).bit_length()
-    axis_bits = (62 - index_bits) // 3
+    axis_bits = (62 - len(spheres).bit_length()) // 3
     xyz = (offsets * (1 / max(voxel, float(offsets.max()) / (2**axis_bits - 1)))).astype(np.int64)
-    voxels = (xyz[:, 0] << (2 * axis_bits)) | (xyz[:, 1] << axis_bits) | xyz[:, 2]
-    packed = np.sort((voxels << index_bits) | np.arange(len(spheres)))
-    starts = np.flatnonzero(np.diff(packed >> index_bits, prepend=-1))
+    order, starts = grouped((xyz[:, 0] << (2 * axis_bits)) | (xyz[:, 1] << axis_bits) | xyz[:, 2])
     if len(starts) == len(spheres):
         return spheres
-    spheres = spheres[packed & ((1 << index_bits) - 1)]
+    spheres = spheres[order]
     counts = np.diff(starts, append=len(spheres))
     centers = np.add.reduceat(spheres[:, :3], starts) / counts[:, None]
     offsets_from_center = spheres[:, :3] - np.repeat(centers, counts, axis=0)
@@ -68,7 +63,7 @@ def _join(spheres: Float[ndarray, "n 4"], voxel: float) -> Float[ndarray, "m 4"]
     return np.column_stack([centers, radii])
 
 
-def join_to_few(spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "m 4"]:
+def join_to_few(spheres: Spheres) -> Spheres:
     """At most MAX_SOLIDS spheres that together contain all given spheres."""
     voxel = JOIN_VOXEL
     while len(spheres) > MAX_SOLIDS:
@@ -77,13 +72,14 @@ def join_to_few(spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "m 4"]:
     return spheres
 
 
-def cover_triangles(triangles: Float[ndarray, "n 3 3"], reach: float) -> Float[ndarray, "m 4"]:
+def cover_triangles(triangles: Triangles, reach: float) -> Spheres:
     """Spheres that cover the surface up to POINT_RANGE beyond the arm's `reach` [m]: one around each piece of
     the triangles, merged if they are more than MAX_POINTS."""
     within = reach + float(POINT_RANGE)
     near = split(triangles, reach / 4, within)
+    area = np.linalg.norm(scaled_normals(near), axis=1).sum() / 2
     # bisected triangles have an area of about spacing² / 4
-    spacing = max(MESH_SPACING, float(np.sqrt(4 * _area(near) / MAX_POINTS)))
+    spacing = max(MESH_SPACING, float(np.sqrt(4 * area / MAX_POINTS)))
     triangle_parts = split(near, spacing, within)
     centers = triangle_parts.mean(axis=1)
     radii = np.linalg.norm(triangle_parts - centers[:, None], axis=2).max(axis=1, initial=0.0)
@@ -91,11 +87,7 @@ def cover_triangles(triangles: Float[ndarray, "n 3 3"], reach: float) -> Float[n
     return _join(spheres, spacing) if len(spheres) > MAX_POINTS else spheres
 
 
-def _area(triangles: Float[ndarray, "n 3 3"]) -> float:
-    return float(np.linalg.norm(scaled_normals(triangles), axis=1).sum() / 2)
-
-
-def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> tuple[ndarray, ...]:
+def build_grid(cloud: Spheres, radius: float) -> tuple[ndarray, ...]:
     """The grid over the covering spheres `cloud` of obstacles: the fields of SceneArrays from `points` to
     `grid_frame`. `radius` is that of the robot's largest sphere [m]."""
     if not len(cloud):

@@ -57,7 +57,7 @@ def build_pair_tables(
     parents = robot.parents
     pair_rows = arrays.pairs.copy()
     tables = [NO_TABLES]
-    pairs_by_joint: dict[int, list[int]] = {}
+    pairs_by_joint = dict[int, list[int]]()
     for p, (a, b) in enumerate(arrays.pairs[:, :2].tolist()):
         near, far = sorted((int(arrays.frame[a]), int(arrays.frame[b])))
         pairs = pairs_by_joint.setdefault(far - 1, [])

@@ -99,6 +99,14 @@ def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: 
         raise InputError(f"{what} is {shown(value)}; it must be {wanted}")
 
 
+def filled_text(what: str, value: object, wanted: str) -> str:
+    """The value, if it is a text that is not empty. Raises InputError for anything else; the message says
+    that it must be `wanted`."""
+    if not isinstance(value, str) or not value:
+        raise InputError(f"{what} is {shown(value)}; it must be {wanted}")
+    return value
+
+
 def check_list(
     what: str, value: Any, kinds: type | tuple[type, ...] | UnionType, wanted: str, least: int = 0
 ) -> None:
@@ -244,6 +252,17 @@ def within(array: ndarray, most: float = MAX_COORDINATE) -> bool:
     return bool((np.abs(array) <= most).all())
 
 
+def bounded(
+    what: str, value: object, shape: tuple[int, ...], low: float, high: float, wanted: str
+) -> ndarray:
+    """The value as an array of this shape with numbers from `low` to `high`. Raises InputError for anything
+    else; the message says that it must be `wanted`."""
+    array = numbers(value)
+    if array is None or array.shape != shape or not ((array >= low) & (array <= high)).all():
+        raise InputError(f"{what} is {shown(value)}; it must be {wanted}")
+    return array
+
+
 def vector(owner: str, name: str, value: object, size: int | None, most: float = MAX_COORDINATE) -> ndarray:
     """The value as `size` numbers (None: at least one) within ±most. Raises InputError, naming owner.name,
     for anything else."""
@@ -302,11 +321,8 @@ def positive(owner: str, name: str, value: object) -> float:
 
     Raises InputError, naming owner.name, for anything else.
     """
-    array = numbers(value)
-    if array is None or array.ndim != 0 or not MIN_SIZE <= array <= MAX_COORDINATE:
-        rule = f"it must be a number from {MIN_SIZE:g} to {MAX_COORDINATE:g}"
-        raise InputError(f"{owner}.{name} is {shown(value)}; {rule}")
-    return float(array)
+    wanted = f"a number from {MIN_SIZE:g} to {MAX_COORDINATE:g}"
+    return float(bounded(f"{owner}.{name}", value, (), MIN_SIZE, MAX_COORDINATE, wanted))
 
 
 def unit_quaternion(owner: str, value: object, name: str = "wxyz") -> ndarray:
@@ -329,11 +345,8 @@ def rigid_transform(what: str, value: object, slack: float = RIGID_SLACK) -> nda
     Raises InputError, naming `what`, for other shapes, for numbers beyond ±MAX_COORDINATE, for a reflection,
     and if an entry of R R^T or of the last row is off by more than `slack`.
     """
-    T = numbers(value)
-    if T is None or T.shape != (4, 4) or not within(T):
-        raise InputError(
-            f"{what} is {shown(value)}; it must be 4 x 4 finite numbers within ±{MAX_COORDINATE:g}"
-        )
+    wanted = f"4 x 4 finite numbers within ±{MAX_COORDINATE:g}"
+    T = bounded(what, value, (4, 4), -MAX_COORDINATE, MAX_COORDINATE, wanted)
     rotation = T[:3, :3]
     off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(T[3] - LAST_ROW).max())
     handedness = np.linalg.det(rotation)

@@ -66,11 +66,10 @@ def no_files() -> Iterator[None]:
         _closed.reset(before)
 
 
-def file_name(file: object, what: str = "file") -> Path:
+def file_name(file: Any, what: str = "file") -> Path:
     """The name as a path. Raises InputError, naming `what`, for a value that is neither text nor a path, and
     for a name that is too long or that no file can have."""
-    if not isinstance(file, str | os.PathLike):
-        raise InputError(f"{what} is {shown(file)}; it must be a file name: a text or a pathlib.Path")
+    check_type(what, file, (str, os.PathLike), "a file name: a text or a pathlib.Path")
     path = Path(file)
     try:
         os.lstat(path)
@@ -270,7 +269,7 @@ class _Composer:
         self.loader = loader
         self.where = where
         self.count = 0
-        self.anchors: dict[str, tuple[Any, int]] = {}
+        self.anchors = dict[str, tuple[Any, int]]()
         """Value of each anchor, and the number of values that it contains, itself included."""
 
     def document(self) -> Any:
@@ -511,7 +510,7 @@ class JsonLines:
 
         Raises InputError, naming file and line, for a complete line that is not a JSON object.
         """
-        self.rows: list[JsonObject] = []
+        self.rows = list[JsonObject]()
         self._file = file
         self._without_cut_line: bytes | None = None
         if file is None or not file.is_file():

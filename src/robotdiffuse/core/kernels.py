@@ -113,7 +113,7 @@ def _folder_name(module: str) -> str:
 def _compiled_from(module: str) -> set[str]:
     """The modules with code or constants that are compiled into a module: itself and the modules of the
     package that it imports; of these, each that imports `core.kernels` is followed in the same way."""
-    modules: set[str] = set()
+    modules = set[str]()
     waiting = [module]
     while waiting:
         name = waiting.pop()

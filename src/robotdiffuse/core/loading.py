@@ -20,7 +20,7 @@ class _Clock(threading.local):
 
 
 _clock = _Clock()
-compiled: list[str] = []
+compiled = list[str]()
 """Names of the functions that this process has compiled or is compiling; for reports of progress."""
 on_first_compilation: Callable[[], None] | None = None
 """Called when this process begins to compile its first function; then set to None."""

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
-from robotdiffuse.core.errors import InputError, described, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_type, described, unknown_name
 
 
 @dataclass(frozen=True)
@@ -42,9 +43,9 @@ class AddedEntries(NamedTuple):
     table of metrics."""
 
 
-_tables: dict[str, "Registry"] = {}
-_adopted: dict[str, dict[str, Entry]] = {}
-imported: list[str] = []
+_tables = dict[str, "Registry"]()
+_adopted = dict[str, dict[str, Entry]]()
+imported = list[str]()
 """Modules that `import_modules` has imported."""
 
 
@@ -106,10 +107,7 @@ class Registry(dict[str, Entry]):
             raise InputError(
                 f"{self.what} {name}: its entry point {point.value} cannot be loaded: {described(error)}"
             ) from None
-        if not isinstance(entry, Entry):
-            raise InputError(
-                f"{self.what} {name}: its entry point {point.value} is {shown(entry)}; it must be an Entry"
-            )
+        check_type(f"{self.what} {name}: its entry point {point.value}", entry, Entry, "an Entry")
         self[name] = entry
         return entry
 
@@ -154,8 +152,7 @@ class Registry(dict[str, Entry]):
         Raises:
             InputError: For an unknown name.
         """
-        module, _, attribute = self.entry(name).location.partition(":")
-        return getattr(import_module(module), attribute)
+        return resolve_name(self.entry(name).location)
 
     def settings(self, name: str) -> type | None:
         """Import the settings class of an entry.
@@ -172,9 +169,8 @@ class Registry(dict[str, Entry]):
         entry = self.entry(name)
         if not entry.settings:
             return None
-        entry_module = entry.location.partition(":")[0]
-        module, _, attribute = entry.settings.rpartition(":")
-        return getattr(import_module(module or entry_module), attribute)
+        module = entry.location.partition(":")[0]
+        return resolve_name(entry.settings if ":" in entry.settings else f"{module}:{entry.settings}")
 
     def defaults(self, name: str) -> Any:
         """Make the default settings of an entry.

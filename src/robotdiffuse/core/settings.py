@@ -15,7 +15,7 @@ import inspect
 import math
 import sys
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -24,7 +24,7 @@ from numbers import Integral, Real
 from types import UnionType
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from robotdiffuse.core.errors import InputError, shortened, shown, suggestion, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, shortened, shown, suggestion
 from robotdiffuse.core.files import JsonObject, parse_yaml
 from robotdiffuse.core.registry import Registry
 
@@ -77,7 +77,7 @@ class Bound:
 class OneOf:
     """The value must be one of these names."""
 
-    names: Iterable[str]
+    names: Collection[str]
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> JsonObject:
         return handler(schema) | {"enum": list(self.names)}
@@ -202,7 +202,7 @@ class Settings:
         for name in values:
             if name not in fields:
                 raise InputError(f"{where}.{shortened(name)} is not a setting; known: {', '.join(fields)}")
-        checked: dict[str, Any] = {}
+        checked = dict[str, Any]()
         for name, field in fields.items():
             if name in values:
                 at = f"{where}.{name}"
@@ -230,7 +230,7 @@ class Settings:
         """
         owner = self.settings_name or type(self).__name__
         valid_assignments = ", ".join(setting.assignment for setting in self.describe())
-        values: dict[str, Any] = {}
+        values = dict[str, Any]()
         for text in assignments:
             name, equals, value = text.partition("=")
             if not equals or not name:
@@ -291,7 +291,7 @@ class Settings:
         """
         hints = _hints(type(self))
         documents = field_docstrings(type(self))
-        settings: list[Setting] = []
+        settings = list[Setting]()
         for name, hint in hints.items():
             value = getattr(self, name)
             if isinstance(value, Settings):
@@ -372,8 +372,8 @@ def _check_mark(where: str, mark: Any, value: Any, owner: object) -> None:
             raise InputError(f"{where} is {value}; it must be {problem}")
     elif isinstance(mark, Filled) and value == ():
         raise InputError(f"{where} is (); it must have at least one entry")
-    elif isinstance(mark, OneOf) and isinstance(value, str) and value not in mark.names:
-        raise unknown_name(where, value, mark.names)
+    elif isinstance(mark, OneOf) and isinstance(value, str):
+        check_name(where, value, mark.names)
     elif isinstance(mark, SettingsOf) and owner is not None and value is not None:
         name = getattr(owner, mark.field)
         expected = mark.table.settings(name) if name in mark.table else None
@@ -411,7 +411,7 @@ def _rule(hint: Any) -> str:
 
 def field_docstrings(kind: type) -> dict[str, str]:
     """The docstring below each field of a class and of its base classes."""
-    docstrings: dict[str, str] = {}
+    docstrings = dict[str, str]()
     for cls in reversed(kind.__mro__):
         if not dataclasses.is_dataclass(cls):
             continue

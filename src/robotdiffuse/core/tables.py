@@ -89,7 +89,7 @@ class Table:
     def best(self) -> set[tuple[int, int]]:
         """Row and column of each best figure. Figures with the same text are equally good. If more than half
         of the rows have the best figure of a column, it is not marked."""
-        places: set[tuple[int, int]] = set()
+        places = set[tuple[int, int]]()
         for j, column in enumerate(self.columns):
             values = {i: _value(row[j]) for i, row in enumerate(self.rows)}
             numbers = {i: value for i, value in values.items() if value == value}

@@ -9,7 +9,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.core.errors import MAX_RPY, InputError, unit_quaternion, vector
-from robotdiffuse.core.types import Points, Pose, Rotation, Spheres, Vector
+from robotdiffuse.core.types import Points, Pose, Quaternion, Rotation, Spheres, Vector
 
 IDENTITY = np.eye(4)
 
@@ -34,7 +34,7 @@ def _rotation(w: Any, x: Any, y: Any, z: Any) -> list[list[Any]]:
     ]
 
 
-def quaternion_from_rotation(rotation: Rotation | Pose) -> Float[ndarray, "4"]:
+def quaternion_from_rotation(rotation: Rotation | Pose) -> Quaternion:
     """Unit quaternion wxyz with w >= 0 of a rotation matrix, or of the rotation of a pose (Bar-Itzhack's
     eigenvector method)."""
     r = rotation
@@ -163,6 +163,11 @@ def placed_each(T: Float[ndarray, "n 4 4"], points: Points) -> Float[ndarray, "n
 def moved_spheres(T: Pose, spheres: Spheres) -> Spheres:
     """Spheres (x y z radius) of a frame b in frame a, where T is the pose T_a_b."""
     return np.column_stack([placed(T, spheres[:, :3]), spheres[:, 3]])
+
+
+def box_around(points: Points) -> Float[ndarray, "2 3"]:
+    """Lower and upper corner of the axis-aligned box around the points."""
+    return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
 def ball_around(points: Points) -> tuple[Vector, float]:

@@ -54,11 +54,14 @@ Vector = Float[ndarray, "3"]
 """A point [m] or a direction."""
 Rotation = Float[ndarray, "3 3"]
 """A rotation matrix."""
+Quaternion = Float[ndarray, "4"]
+"""A rotation, w x y z."""
 Pose = Float[ndarray, "4 4"]
 """A rigid transform."""
 Poses = Float[ndarray, "_ 4 4"]
 Spheres = Float[ndarray, "_ 4"]
 """Rows of center x y z and radius [m]."""
+NO_SPHERES = np.zeros((0, 4))
 Mask = Bool[ndarray, "_"]
 if TYPE_CHECKING:  # types of fields that hold arrays and can be set to anything that NumPy converts to them
 
@@ -602,7 +605,7 @@ def check_motion_arrays(
     twice = repeated(names)
     if twice:
         raise InputError(f"{where}joint_names has {joined(twice)} more than once")
-    checked: dict[str, ndarray] = {}
+    checked = dict[str, ndarray]()
     count = None
     for name, value in arrays.items():
         if name == "times":

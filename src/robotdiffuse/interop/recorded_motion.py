@@ -206,12 +206,12 @@ SUPPORTED = (
 )
 
 
-def read_json_file(file: FilePath, topic: str | None = None) -> RecordedMotion:
+def read_json_file(file: FilePath, topic: str | None) -> RecordedMotion:
     """Read a result, a trajectory, or a ROS or MoveIt message in the JSON form of rosbridge."""
     return motion_from_record(read_json(file), str(file))
 
 
-def read_yaml(file: FilePath, topic: str | None = None) -> RecordedMotion:
+def read_yaml(file: FilePath, topic: str | None) -> RecordedMotion:
     """Read a JointTrajectory, RobotTrajectory or DisplayTrajectory, as `ros2 topic echo` prints it."""
     text = read_text(file, largest=MAX_YAML_SIZE).rstrip()
     text = text.removesuffix("---")  # the end of a message
@@ -225,7 +225,7 @@ def write_yaml(problem: Problem, trajectory: Trajectory, file: FilePath) -> None
     write_atomically(file, text)
 
 
-def read_csv(file: FilePath, topic: str | None = None) -> RecordedMotion:
+def read_csv(file: FilePath, topic: str | None) -> RecordedMotion:
     """Read a motion in the columns of `Trajectory.save`: time, then NAME or NAME_position for each joint, and
     optionally NAME_velocity and NAME_acceleration. Without time, the rows are waypoints."""
     with reading(file):

@@ -596,7 +596,7 @@ def opened_recording(file: Path, largest: int = MAX_FILE_SIZE) -> Iterator[Recor
         yield Recording(kinds, of_file)
 
 
-def read_recording(file: Path, topic: str | None = None) -> RecordedMotion:
+def read_recording(file: Path, topic: str | None) -> RecordedMotion:
     """Read the motion on a topic of an MCAP file or bag; see `choose_topic`."""
     with reading(file), opened_recording(file) as recording:
         name = choose_topic(recording.kinds, topic, str(file))

@@ -125,8 +125,8 @@ def without_known(centers: Points, edge: float, robot: Robot, known_scene: Scene
     return centers[~near_scene(robot, known_scene, centers, edge / 2 - 1e-3)]
 
 
-Box = tuple[tuple[float, ...], tuple[float, ...]]
-"""Low and high corner [m]."""
+Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Low and high corner of a box [m]."""
 
 
 LOST_WIDTH = 3
@@ -216,7 +216,7 @@ class CrossedSpace:
         return None if self.probability is None else float(self.probability[self.voxels].sum(dtype=float))
 
     @property
-    def region(self) -> Box | None:
+    def region(self) -> Corners | None:
         """The bounding box of the connected part of the voxels with the largest summed probability or,
         without a prediction, with the most voxels; None if there are no voxels."""
         if not self.voxels.any():
@@ -271,10 +271,6 @@ def confidence(assumption: str, crossed: CrossedSpace) -> float:
         else probability_free(crossed.risk, ONE_VIEW)
     )
     return min(stated, UNSEEN_CONFIDENCE) if crossed.blind else stated
-
-
-Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
-"""Low and high corner of a box [m]."""
 
 
 HIT = np.float32(3.0)
@@ -553,7 +549,7 @@ class ViewMemory:
 
     def points(self, free: Voxels) -> tuple[Points, PointErrors]:
         """The mean of the kept views' points in each cell of a grid [m], and the errors of each mean, the
-        largest of its points (see `point_errors`). A view has at most one point in a cell (see
+        largest errors of its points (see `point_errors`). A view has at most one point in a cell (see
         `seen_points`).
 
         Stray points are left out: points in free voxels of the map (`free`), through which other views saw,

@@ -69,7 +69,7 @@ the curve divides errors by the square of the step."""
 CLEARANCE_SHARE = 0.5
 """A note names the clearance of a motion that keeps less than this fraction of the clearance of the call."""
 ROUND = InverseKinematicsSettings(max_rounds=1)
-"""For the search for other configurations of the end pose, see OTHER_ENDS."""
+"""Settings of the inverse kinematics that finds OTHER_ENDS."""
 
 
 def follow_line(context: PlanningContext) -> PlanResult | None:

@@ -6,7 +6,6 @@ that they need and interprets their results.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -65,8 +64,7 @@ SAME_POSE_TOLERANCE = 1e-3
 """Maximum difference of the poses of a line's link at the goal configurations [m], [rad]."""
 
 
-@dataclass(frozen=True)
-class ConstraintViolation:
+class ConstraintViolation(NamedTuple):
     """A place where a constraint is violated, or not proved."""
 
     constraint: Constraint

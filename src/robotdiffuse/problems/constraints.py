@@ -14,7 +14,7 @@ import numpy as np
 from robotdiffuse.core.errors import (
     MAX_COORDINATE,
     InputError,
-    numbers,
+    bounded,
     rigid_motion,
     rigid_transform,
     shown,
@@ -73,13 +73,8 @@ class FrameConstraint(Value):
                 content = row if name not in DIRECTION_FIELDS or abs(length - 1) < 1e-15 else row / length
             if name in SCALAR_BOUNDS and not (content is None and NoneType in get_args(field.type)):
                 low, high, unit = SCALAR_BOUNDS[name]
-                value = numbers(content)
-                if value is None or value.ndim != 0 or not low <= value <= high:
-                    raise InputError(
-                        f"{location} is {shown(content)}; "
-                        f"it must be a number from {low:g} to {high:.6g} [{unit}]"
-                    )
-                content = float(value)
+                wanted = f"a number from {low:g} to {high:.6g} [{unit}]"
+                content = float(bounded(location, content, (), low, high, wanted))
             if name == "T_base_box":
                 content = BASE_FRAME if content is None else rigid_transform(location, content)
             object.__setattr__(self, name, read_only(content))
@@ -87,7 +82,7 @@ class FrameConstraint(Value):
     def moved(self: Self, T: Pose) -> Self:
         """The constraint after the rigid motion T. Raises InputError unless T is rigid."""
         T = rigid_motion(T)
-        after: dict[str, Any] = {}
+        after = dict[str, Any]()
         for name in ("direction", "normal", "point", "T_base_box"):
             if hasattr(self, name):
                 before = getattr(self, name)

@@ -33,7 +33,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robotdiffuse.core.errors import InputError, check_name, located, numbers, shown, unit_quaternion, vector
+from robotdiffuse.core.errors import (
+    InputError,
+    check_name,
+    check_type,
+    filled_text,
+    located,
+    numbers,
+    shown,
+    unit_quaternion,
+    vector,
+)
 from robotdiffuse.core.files import JsonObject
 from robotdiffuse.core.settings import converted
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
@@ -125,7 +135,7 @@ wrote, e.g. 0.3 for 0.30000000000000004; with fewer decimals, the hashes of clou
 
 def _fields_of(kind: type) -> tuple[dict[str, Schema], list[str]]:
     """Schemas of the fields of a shape or constraint in a file, by name, and its required fields."""
-    schemas: dict[str, Schema] = {}
+    schemas = dict[str, Schema]()
     for field in fields(kind):
         if field.name == "T_base_box":
             schemas |= POSE
@@ -158,11 +168,10 @@ def pose_of(where: str, values: JsonObject) -> Pose:
     return transform(xyz, rotation_from_quaternion(unit_quaternion(where, values.get("wxyz", IDENTITY))))
 
 
-def entries_of(where: str, data: object, what: str) -> list[tuple[str, Any]]:
+def entries_of(where: str, data: Any, what: str) -> list[tuple[str, Any]]:
     """The entries of a list, each with its place for messages. Raises InputError for anything else, with a
     message that says what the list should hold (`what`)."""
-    if not isinstance(data, list):
-        raise InputError(f"{where} is {shown(data)}; it must be a list of {what}")
+    check_type(where, data, list, f"a list of {what}")
     return [(f"{where}[{i}]", entry) for i, entry in enumerate(data)]
 
 
@@ -173,12 +182,6 @@ def rounded(value: Any) -> Any:
     if isinstance(value, list):
         return [rounded(item) for item in value]
     return {key: rounded(item) for key, item in value.items()} if isinstance(value, dict) else value
-
-
-def _text(where: str, value: object) -> str:
-    if not isinstance(value, str) or not value:
-        raise InputError(f"{where} is {shown(value)}; it must be a name")
-    return value
 
 
 def _touch_links(where: str, entry: JsonObject) -> tuple[str, ...]:
@@ -197,8 +200,8 @@ def equipped(robot: Robot, values: JsonObject, folder: Path, notes: list[str]) -
         tool = check_fields("tool", values["tool"], ("link",), TOOL_FIELDS)
         shapes, shape_notes = read_scene(tool.get("shapes", []), folder, field="tool.shapes")
         notes += shape_notes
-        link = _text("tool.link", tool["link"])
-        name = _text("tool.name", tool.get("name", TOOL))
+        link = filled_text("tool.link", tool["link"], "a name")
+        name = filled_text("tool.name", tool.get("name", TOOL), "a name")
         touch = _touch_links("tool", tool)
         waiting = link, pose_of("tool", tool), shapes.shapes, touch, name
         needed = {link, *touch}
@@ -217,14 +220,15 @@ def equipped(robot: Robot, values: JsonObject, folder: Path, notes: list[str]) -
         with located(location):
             attached_shape = read_shape(location, shape, folder, notes)
             touch = _touch_links(location, entry)
-            robot = robot.attach(attached_shape, _text(f"{location}.link", entry["link"]), touch)
+            link = filled_text(f"{location}.link", entry["link"], "a name")
+            robot = robot.attach(attached_shape, link, touch)
     # the tool waited for its links, which may be held objects
     return robot if waiting is None else robot.with_tool(*waiting)
 
 
 def equipment_entries(robot: Robot, folder: Path | None) -> JsonObject:
     """The fields `tool` and `attached` of a robot, in the form that `equipped` reads."""
-    entries: JsonObject = {}
+    entries = JsonObject()
     for body in robot.attached:
         solids = [shape for shape in body.shapes if isinstance(shape, Shape)]
         if len(solids) < len(body.shapes) or not (body.tool or len(solids) == 1):
@@ -346,12 +350,8 @@ def constraint_entry(constraint: Constraint) -> JsonObject:
     return {constraint.kind: values}
 
 
-def _moving(where: str, entry: object, setting: Setting) -> MovingObstacle:
-    if not isinstance(entry, dict):
-        raise InputError(
-            f"{where} is {shown(entry)}; it must be a shape and its motion, e.g. "
-            "{sphere: {...}, velocity: [0, 0.3, 0]}"
-        )
+def _moving(where: str, entry: Any, setting: Setting) -> MovingObstacle:
+    check_type(where, entry, dict, "a shape and its motion, e.g. {sphere: {...}, velocity: [0, 0.3, 0]}")
     motion = {name: value for name, value in entry.items() if name in MOTION_FIELDS}
     shape = {name: value for name, value in entry.items() if name not in motion}
     if len(shape) != 1 or not shape.keys() <= SHAPES.keys():

@@ -19,7 +19,16 @@ from typing import Any
 import numpy as np
 import yaml
 
-from robotdiffuse.core.errors import InputError, check_name, check_type, counted, located, repeated, shown
+from robotdiffuse.core.errors import (
+    InputError,
+    check_name,
+    check_type,
+    counted,
+    filled_text,
+    located,
+    repeated,
+    shown,
+)
 from robotdiffuse.core.files import (
     JsonLines,
     JsonObject,
@@ -393,11 +402,8 @@ def _problem(
 def _robot(name: object, locked: object, folder: Path, robots: Mapping[str, Robot] | None) -> Robot:
     if robots is not None:
         check_name("robot", name, robots)
-    if not isinstance(name, str) or not name:
-        raise InputError(
-            f"robot is {shown(name)}; it must be a robot's file, or the name of an added robot or of a "
-            f"bundled one: {', '.join(ROBOTS)}"
-        )
+    wanted = f"a robot's file, or the name of an added robot or of a bundled one: {', '.join(ROBOTS)}"
+    name = filled_text("robot", name, wanted)
     if robots is None and name not in ROBOTS and (name.lower().endswith(FILE_ENDINGS) or "/" in name):
         name = str((folder / name).absolute())
     values = converted("locked", dict[str, Number], locked)
@@ -486,7 +492,7 @@ class CaseFile:
         """Reads the file. Raises InputError, which names file and line, for a line that does not hold the
         fields of a row. The problems are checked when cases are made of them."""
         self._lines = JsonLines(file)
-        self._rows: dict[str, JsonObject] = {}
+        self._rows = dict[str, JsonObject]()
         for number, row in enumerate(self._lines.rows, start=1):
             if row.keys() != ROW_FIELDS:
                 raise InputError(
@@ -523,7 +529,7 @@ class CaseFile:
         Problems that are not in the file yet are generated and added; with a search, problems that are
         neither trivial nor searched yet are searched.
         """
-        case_rows: list[JsonObject] = []
+        case_rows = list[JsonObject]()
         numbers = itertools.count()
         while len(case_rows) < count:
             number = next(numbers)

@@ -7,6 +7,7 @@ Vectors may be lists or mappings (x, y, z), and quaternions are xyzw.
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy import ndarray
 from robotdiffuse.core.errors import (
     InputError,
     check_name,
+    check_type,
     joined,
     located,
     numbers,
@@ -35,7 +37,7 @@ from robotdiffuse.core.transforms import (
     rotation_z_to,
     transform,
 )
-from robotdiffuse.core.types import Pose, Vector, frozen_dataclass
+from robotdiffuse.core.types import Pose, Quaternion, Vector, frozen_dataclass
 from robotdiffuse.robots.bodies import AttachedBody, polygon_around_circle
 from robotdiffuse.robots.kinematic_tree import MOVING_KINDS
 from robotdiffuse.robots.robot import MIMIC_SLACK, Robot
@@ -87,7 +89,7 @@ TYPE_NUMBERS = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone", 5: "prism"}
 """Names of the types of shape_msgs/SolidPrimitive, by their numbers in messages."""
 
 
-def mapping_of(where: str, value: object, *names: str) -> JsonObject:
+def mapping_of(where: str, value: Any, *names: str) -> JsonObject:
     """The value as a mapping, or the mapping in its nested field names[0].names[1]...; None counts as empty.
 
     where: the place of the value, for messages.
@@ -95,8 +97,7 @@ def mapping_of(where: str, value: object, *names: str) -> JsonObject:
     for name in names:
         value = mapping_of(where, value).get(name)
         where = name if where in (SCENE, REQUEST) else f"{where}.{name}"
-    if value is not None and not isinstance(value, dict):
-        raise InputError(f"{where} is {shown(value)}; it must be a mapping")
+    check_type(where, value, (dict, NoneType), "a mapping")
     return value or {}
 
 
@@ -104,8 +105,7 @@ def list_of(where: str, entry: JsonObject, name: str) -> list[Any]:
     """The list in the field `name` of an entry; None counts as empty. where: prefix of the field's name in
     messages."""
     value = entry.get(name)
-    if value is not None and not isinstance(value, list):
-        raise InputError(f"{where}{name} is {shown(value)}; it must be a list")
+    check_type(f"{where}{name}", value, (list, NoneType), "a list")
     return value or []
 
 
@@ -359,7 +359,7 @@ def object_shapes(entry: JsonObject, frames: MoveItFrames, folder: Path) -> list
         )
     T_base_object = frames.of_header("header", entry) @ pose_of("pose", entry.get("pose") or NO_POSE)
     name = "object" if entry.get("id") in (None, "") else str(entry["id"])
-    shapes: list[Shape] = []
+    shapes = list[Shape]()
     for key, plural in (("plane", "planes"), ("primitive", "primitives"), ("mesh", "meshes")):
         parts = mappings_of("", entry, plural)
         poses = list_of("", entry, f"{key}_poses")
@@ -403,7 +403,7 @@ def _triangles(where: str, part: JsonObject, folder: Path) -> tuple[ndarray, nda
     return np.array(rows).reshape(-1, 3), faces
 
 
-def _cone(size: Float[ndarray, "2"], xyz: Vector, wxyz: Float[ndarray, "4"], name: str) -> Mesh:
+def _cone(size: Float[ndarray, "2"], xyz: Vector, wxyz: Quaternion, name: str) -> Mesh:
     """A pyramid around a cone with size = (height, radius) [m] about the z axis; the origin is at half the
     height."""
     from robotdiffuse.robots.fitting.convex_parts import convex_hull  # SciPy, which few problems need
@@ -677,8 +677,7 @@ def _pose_goal(where: str, goal: JsonObject, frames: MoveItFrames, notes: list[s
         raise InputError(
             f"{where} constrains {link} and {orientation.get('link_name')}; both must constrain one link"
         )
-    if not isinstance(link, str):
-        raise InputError(f"{at}.link_name is {shown(link)}; it must be the name of a link")
+    check_type(f"{at}.link_name", link, str, "the name of a link")
     offset = xyz_of("target_point_offset", position.get("target_point_offset") or [0, 0, 0])
     if offset.any():
         raise InputError(f"{at}.target_point_offset is {shown(offset)}; it must be zero")

@@ -20,6 +20,7 @@ from robotdiffuse.core.errors import (
     MAX_COORDINATE,
     MIN_RATE,
     InputError,
+    bounded,
     check_list,
     check_name,
     check_type,
@@ -113,17 +114,13 @@ class PoseGoal(Value):
     orientation, validated to 15 degrees."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.frame, str):
-            raise InputError(f"goal.frame is {shown(self.frame)}; it must be the name of a link")
+        check_type("goal.frame", self.frame, str, "the name of a link")
         object.__setattr__(self, "T_base_frame", rigid_transform("goal.T_base_frame", self.T_base_frame))
         for name, limit, unit in (("xyz_tolerance", MAX_COORDINATE, "m"), ("rpy_tolerance", MAX_TURN, "rad")):
             value = getattr(self, name)
             if value is not None:
-                array = numbers(value)
-                if array is None or array.shape != (3,) or not ((array >= 0) & (array <= limit)).all():
-                    raise InputError(
-                        f"goal.{name} is {shown(value)}; it must be 3 numbers from 0 to {limit:g} [{unit}]"
-                    )
+                wanted = f"3 numbers from 0 to {limit:g} [{unit}]"
+                array = bounded(f"goal.{name}", value, (3,), 0.0, limit, wanted)
                 object.__setattr__(self, name, array)
         super().__post_init__()
 
@@ -751,10 +748,8 @@ def check_problem(problem: object, field: str = "problem") -> None:
 
 def check_clearance(value: object) -> float:
     """The value as a distance [m]. Raises InputError unless it is from 0 to MAX_CLEARANCE."""
-    clearance = numbers(value)
-    if clearance is None or clearance.ndim != 0 or not 0 <= clearance <= MAX_CLEARANCE:
-        raise InputError(f"clearance is {shown(value)}; it must be a distance from 0 to {MAX_CLEARANCE:g} m")
-    return float(clearance)
+    wanted = f"a distance from 0 to {MAX_CLEARANCE:g} m"
+    return float(bounded("clearance", value, (), 0.0, MAX_CLEARANCE, wanted))
 
 
 def check_unknown(field: str, value: object) -> str:

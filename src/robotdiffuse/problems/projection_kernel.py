@@ -18,7 +18,7 @@ from robotdiffuse.problems.constraint_kernel import (
     pose_frame,
     row_value,
 )
-from robotdiffuse.robots.ik_kernel import PRISMATIC, damped_step
+from robotdiffuse.robots.ik_kernel import PRISMATIC, limited_step
 
 ANGLE_WEIGHT = 0.3
 """An error of 1 rad counts as this many meters in projection [m/rad]."""
@@ -124,17 +124,21 @@ def step(rows, limits, q, most, work):
     count = _residuals(rows, limits, q, work)
     if count == 0:
         return 0
-    work.held[:] = False
-    damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
-    # if joints at a limit would move beyond it, solve again without these joints
-    clamped_joint = False
-    for k in range(dof):
-        at_low = q[k] <= rows.lower[k]
-        at_high = q[k] >= rows.upper[k]
-        if not rows.continuous[k] and ((at_low and work.step[k] < 0.0) or (at_high and work.step[k] > 0.0)):
-            work.held[k] = clamped_joint = True
-    if clamped_joint:
-        damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
+    limited_step(
+        work.J,
+        work.e,
+        DAMPING,
+        count,
+        dof,
+        q,
+        rows.lower,
+        rows.upper,
+        rows.continuous,
+        work.held,
+        work.A,
+        work.y,
+        work.step,
+    )
     distance = np.sqrt((work.step * work.step).sum())
     if distance < 1e-9:
         return -1

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.errors import MAX_COORDINATE, InputError, check_type, numbers, shown, within
+from robotdiffuse.core.errors import MAX_COORDINATE, InputError, bounded, check_type, shown, within
 from robotdiffuse.core.types import (
     GivenVector,
     Points,
@@ -154,18 +154,9 @@ class Payload(EqualByContent):
 
     def __post_init__(self) -> None:
         for name, shape, lower in (("mass", (), 0.0), ("com", (3,), -MAX_COORDINATE), ("moments", (3,), 0.0)):
-            argument = getattr(self, name)
-            value = numbers(argument)
-            if (
-                value is None
-                or value.shape != shape
-                or not ((value >= lower) & (value <= MAX_COORDINATE)).all()
-            ):
-                expected = "a number of kg" if name == "mass" else "3 numbers"
-                raise InputError(
-                    f"payload.{name} is {shown(argument)}; it must be {expected} from {lower:g} to "
-                    f"{MAX_COORDINATE:g}"
-                )
+            expected = "a number of kg" if name == "mass" else "3 numbers"
+            wanted = f"{expected} from {lower:g} to {MAX_COORDINATE:g}"
+            value = bounded(f"payload.{name}", getattr(self, name), shape, lower, MAX_COORDINATE, wanted)
             object.__setattr__(self, name, value if shape else float(value))
         if 2 * max(self.moments) > sum(self.moments) * (1 + 1e-9):
             raise InputError(

@@ -140,6 +140,24 @@ def damped_step(J, error, damping, rows, joints, held, A, y, step):
 
 
 @inner_kernel()
+def limited_step(J, error, damping, rows, joints, q, lower, upper, endless, held, A, y, step):
+    """Write the `damped_step` at q, in which joints that would be pushed through a limit are held.
+
+    `endless` [dof] marks joints without limits; `held` [dof] is scratch memory.
+    """
+    held[:] = False
+    damped_step(J, error, damping, rows, joints, held, A, y, step)
+    limit_hit = False
+    for j in range(joints):
+        at_low = q[j] <= lower[j]
+        at_high = q[j] >= upper[j]
+        if not endless[j] and ((at_low and step[j] < 0.0) or (at_high and step[j] > 0.0)):
+            held[j] = limit_hit = True
+    if limit_hit:
+        damped_step(J, error, damping, rows, joints, held, A, y, step)
+
+
+@inner_kernel()
 def _is_new(q, others, count, kinds, min_distance):
     """Whether q differs from each of the first `count` others by more than min_distance in at least one
     joint. Values of continuous joints that are a turn apart are equal."""
@@ -211,6 +229,7 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
     y = np.zeros(6)
     step = np.zeros(dof)
     held = np.zeros(dof, np.bool_)
+    endless = kinds == CONTINUOUS
     trial = np.empty(dof)
     solutions = np.empty((len(known) + wanted, dof))
     solutions[: len(known)] = known
@@ -238,17 +257,7 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
             if jacobian_outdated:
                 _jacobian(T, axes, origins, kinds, joints, rotation_weight, J)
                 jacobian_outdated = False
-            # hold joints that the step would push through a limit, and solve for the others again
-            held[:] = False
-            damped_step(J, error, damping * cost, rows, joints, held, A, y, step)
-            limit_hit = False
-            for j in range(joints):
-                if kinds[j] != CONTINUOUS and (
-                    (q[j] <= lower[j] and step[j] < 0.0) or (q[j] >= upper[j] and step[j] > 0.0)
-                ):
-                    held[j] = limit_hit = True
-            if limit_hit:
-                damped_step(J, error, damping * cost, rows, joints, held, A, y, step)
+            limited_step(J, error, damping * cost, rows, joints, q, lower, upper, endless, held, A, y, step)
             for j in range(dof):
                 trial[j] = q[j]
                 if j < joints:

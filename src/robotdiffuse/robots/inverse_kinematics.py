@@ -5,14 +5,14 @@ from dataclasses import dataclass
 from numbers import Integral
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, rigid_transform, shown
 from robotdiffuse.core.settings import Count, Settings
 from robotdiffuse.core.types import Configuration, Configurations, Mask, Pose, for_kernels, nearest_first
 from robotdiffuse.robots.ik_kernel import CONTINUOUS, PRISMATIC, REVOLUTE, IKChain, IKParameters, solve_seeds
-from robotdiffuse.robots.kinematic_tree import KinematicTree
+from robotdiffuse.robots.kinematic_tree import JointMask, KinematicTree
 
 KINDS = {"revolute": REVOLUTE, "prismatic": PRISMATIC, "continuous": CONTINUOUS}
 
@@ -191,7 +191,7 @@ def random_seeds(
     return near + rng.uniform(0.0, 1.0, (count, 1)) * (anywhere - near)
 
 
-def on_other_arm(robot: KinematicTree, link: str) -> Bool[ndarray, "dof"]:
+def on_other_arm(robot: KinematicTree, link: str) -> JointMask:
     """Mask of the planned joints of other arms: joints that neither move a link nor come after it."""
     frame = robot.link_frame(link)
     downstream = robot.moved_by[1:, frame - 1] if frame else np.ones(robot.dof, bool)

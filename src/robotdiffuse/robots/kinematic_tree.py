@@ -13,6 +13,7 @@ from robotdiffuse.core.errors import InputError, check_name, unknown_name
 from robotdiffuse.core.loading import loading
 from robotdiffuse.core.transforms import inverse, moved_spheres, rotation_about, rotation_z_to, transform
 from robotdiffuse.core.types import (
+    NO_SPHERES,
     Configuration,
     Configurations,
     JointValues,
@@ -323,7 +324,7 @@ class KinematicTree(Value):
         return read_only((links, offsets, parents))
 
     @cached_property
-    def frame_offsets(self) -> Float[ndarray, "dof 4 4"]:
+    def frame_offsets(self) -> Poses:
         """Pose of the frame of each planned joint in its parent frame, at joint value 0."""
         return self._frames[1]
 
@@ -384,6 +385,10 @@ class KinematicTree(Value):
         """Constant pose of the link in its frame (see `link_frame`); InputError for an unknown link."""
         return self._link(link)[1]
 
+    def frame_spheres(self, link: str) -> Spheres:
+        """The collision spheres of a link in its frame (see `link_frame`), x y z radius [m]."""
+        return moved_spheres(self.T_frame_link(link), self.spheres[link])
+
     def frames_at(self, q: Configurations) -> list[Poses]:
         """Poses T_base_frame [n, 4, 4] of all frames at configurations."""
         frames = [np.tile(np.eye(4), (len(q), 1, 1))]
@@ -401,7 +406,7 @@ class KinematicTree(Value):
     def placed_spheres(self, q: Configuration) -> Spheres:
         """All collision spheres at one configuration, x y z radius in the base frame [m]."""
         frames = self.frames_at(q[None])
-        parts = [np.zeros((0, 4))]
+        parts = [NO_SPHERES]
         for link, spheres in self.spheres.items():
             parts.append(moved_spheres(frames[self.link_frame(link)][0] @ self.T_frame_link(link), spheres))
         return np.concatenate(parts)

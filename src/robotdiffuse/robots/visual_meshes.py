@@ -3,10 +3,11 @@
 from importlib.resources import as_file, files
 
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import UInt8
 from numpy import ndarray
 
-from robotdiffuse.core.types import Points, Value, frozen_dataclass
+from robotdiffuse.core.types import frozen_dataclass
+from robotdiffuse.robots.bodies import Surface
 from robotdiffuse.robots.robot import Robot
 
 UNIT = 5e-5
@@ -21,11 +22,9 @@ TOOL_COLOR = (0xB0, 0xB6, 0xBE)
 
 
 @frozen_dataclass
-class VisualMesh(Value):
+class VisualMesh(Surface):
     """A triangle mesh in the frame of its link [m], with one sRGB color per face."""
 
-    vertices: Points
-    faces: Int[ndarray, "f 3"]
     colors: UInt8[ndarray, "f 3"]
 
 

@@ -22,9 +22,8 @@ def capsule_polyhedron(radius: float, height: float) -> ConvexMesh:
     corners = np.concatenate([*rings, [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]])
     hull = convex_hull(corners)
     # scale the polyhedron up until the sphere is inside all faces
-    triangles = hull.vertices[hull.faces]
-    normals = scaled_normals(triangles)
-    inradius = (np.einsum("fd,fd->f", normals, triangles[:, 0]) / np.linalg.norm(normals, axis=1)).min()
+    normals = scaled_normals(hull.triangles)
+    inradius = (np.einsum("fd,fd->f", normals, hull.triangles[:, 0]) / np.linalg.norm(normals, axis=1)).min()
     corners *= radius / inradius
     if height == 0:
         return convex_hull(corners)

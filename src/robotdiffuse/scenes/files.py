@@ -10,7 +10,16 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.core.errors import MAX_RPY, InputError, check_name, check_type, located, shown, vector
+from robotdiffuse.core.errors import (
+    MAX_RPY,
+    InputError,
+    check_name,
+    check_type,
+    filled_text,
+    located,
+    shown,
+    vector,
+)
 from robotdiffuse.core.files import JsonObject, known_ending, read_array
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
@@ -78,7 +87,7 @@ def read_scene(
     """
     or_file = " or the name of a MoveIt scene file" if field == "scene" else ""
     check_type(field, entries, list, f"a list of shapes{or_file}")
-    notes: list[str] = []
+    notes = list[str]()
     shapes = [read_shape(f"{field}[{i}]", entry, folder, notes) for i, entry in enumerate(entries)]
     scene = Scene(shapes, contacts)  # type: ignore[arg-type]
     for i, (shape, named) in enumerate(zip(shapes, scene.shapes, strict=True)):
@@ -108,9 +117,8 @@ def _shape(where: str, kind: type[Shape], values: object, folder: Path, notes: l
         required = ["file", *(name for name in required if name not in content)]
         optional = [name for name in optional if name != "file"]
         values = dict(check_fields(where, values, required, optional))
-        if not isinstance(values["file"], str) or not values["file"]:
-            raise InputError(f"{where}.file is {shown(values['file'])}; it must be the name of a file")
-        values["file"] = str(folder / values["file"])
+        file = filled_text(f"{where}.file", values["file"], "the name of a file")
+        values["file"] = str(folder / file)
         with located(where):
             if kind is PointCloud and "point_radius" not in values:
                 values["point_radius"] = default_radius(values["file"])

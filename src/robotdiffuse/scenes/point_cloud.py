@@ -77,7 +77,7 @@ def occupied_voxels(data: bytes, edge: float) -> Points:
     """
     if not (np.isfinite(edge) and edge > 0):
         raise InputError(f"the resolution is {edge}; it must be a positive number [m]")
-    centers: list[ndarray] = []
+    centers = list[ndarray]()
     count = 0
     at = 0
     waiting = [(np.zeros(3), TREE_DEPTH)]  # stack of inner nodes to read: center and level
@@ -127,6 +127,18 @@ MAX_COLUMNS = 1000
 """Arrays with more columns are refused, since they seem to hold the points as columns."""
 
 
+def grouped(numbers: ndarray) -> tuple[ndarray, ndarray]:
+    """The indices that sort integers, those of equal ones in order; and where each new integer begins among
+    them.
+
+    Each integer and its index, which must fit into 62 bits together, are packed into one integer: sorting
+    these is several times faster than argsort and np.unique.
+    """
+    bits = len(numbers).bit_length()
+    packed = np.sort((numbers << bits) | np.arange(len(numbers)))
+    return packed & ((1 << bits) - 1), np.flatnonzero(np.diff(packed >> bits, prepend=-1))
+
+
 def voxel_thin(points: Points, voxel: float) -> Points:
     """The first point of every occupied cell of a grid with cells `voxel` wide [m], in the original order.
 
@@ -138,14 +150,10 @@ def voxel_thin(points: Points, voxel: float) -> Points:
     cells = np.floor(points * (1 / voxel))
     cells -= cells.min(axis=0)
     extent = cells.max(axis=0) + 1
-    bits = len(points).bit_length()
-    if extent.prod() * 2.0**bits < 2.0**62 and extent.prod() < 2.0**53:
-        # Cell and point numbers are packed into one integer: sorting such integers is several times faster
-        # than np.unique.
+    if extent.prod() * 2.0 ** len(points).bit_length() < 2.0**62 and extent.prod() < 2.0**53:
         cell_number = (cells @ np.array([extent[1] * extent[2], extent[2], 1.0])).astype(np.int64)
-        packed = np.sort((cell_number << bits) | np.arange(len(points)))
-        first = np.flatnonzero(np.diff(packed >> bits, prepend=-1))
-        first_indices = packed[first] & ((1 << bits) - 1)
+        order, starts = grouped(cell_number)
+        first_indices = order[starts]
     else:
         first_indices = np.unique(cells, axis=0, return_index=True)[1]
     return points[np.sort(first_indices)]

@@ -12,11 +12,10 @@ from types import NoneType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from robotdiffuse.core.errors import (
     InputError,
+    bounded,
     check_name,
     check_type,
     counted,
@@ -28,7 +27,6 @@ from robotdiffuse.core.errors import (
     rigid_motion,
     rigid_transform,
     shown,
-    unknown_name,
     vector,
     within,
 )
@@ -44,6 +42,7 @@ from robotdiffuse.core.types import (
     Configuration,
     Pose,
     Poses,
+    Quaternion,
     Value,
     Values,
     VectorOrNone,
@@ -102,7 +101,7 @@ class Scene(Value):
             InputError: For values that are not shapes; and for allowed contacts with unknown obstacles, with
                 values other than lists of names or "all", and with more than 1000 links of one obstacle.
         """
-        named: list[Shape] = []
+        named = list[Shape]()
         names_in_use = set[str]()
         last = dict[str, int]()
         names_of = dict[str, list[str]]()
@@ -289,10 +288,9 @@ def _contacts(
         raise InputError(
             f"allowed_contacts is {shown(allowed)}; it must map obstacles to lists of links or {ALL_LINKS!r}"
         ) from None
-    by_name: dict[str, dict[str | None, None]] = {}  # dictionaries as ordered sets; None: all links
+    by_name = dict[str, dict[str | None, None]]()  # dictionaries as ordered sets; None: all links
     for obstacle, links in entries:
-        if not isinstance(obstacle, str) or (obstacle not in names_of and obstacle not in names):
-            raise unknown_name("obstacle in allowed_contacts:", obstacle, names)
+        check_name("obstacle in allowed_contacts:", obstacle, names)
         every = isinstance(links, str) and links == ALL_LINKS
         listed = isinstance(links, list | tuple) and all(isinstance(link, str) for link in links)
         if not every and not listed:
@@ -340,7 +338,7 @@ def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
             )
     T_base_world = inverse(transform(placed.xpos[base_body], placed.xmat[base_body].reshape(3, 3)))
     colliding = mjcf.colliding_geoms(model)
-    shapes: list[Shape] = []
+    shapes = list[Shape]()
     for geom in range(model.ngeom):
         body = int(model.geom_bodyid[geom])
         if body in robot_bodies or not colliding[geom]:
@@ -435,12 +433,8 @@ class MovingObstacle(Value):
                 self, "velocity", vector(self.name, "velocity", self.velocity, 3, MAX_POINT_SPEED)
             )
         elif self.max_speed is not None:
-            speed = numbers(self.max_speed)
-            if speed is None or speed.ndim != 0 or not 0 <= speed <= MAX_POINT_SPEED:
-                raise InputError(
-                    f"{self.name}.max_speed is {shown(self.max_speed)}; it must be a speed from 0 to "
-                    f"{MAX_POINT_SPEED:g} m/s"
-                )
+            wanted = f"a speed from 0 to {MAX_POINT_SPEED:g} m/s"
+            speed = bounded(f"{self.name}.max_speed", self.max_speed, (), 0.0, MAX_POINT_SPEED, wanted)
             object.__setattr__(self, "max_speed", float(speed))
         else:
             self._check_track()
@@ -585,7 +579,7 @@ class MovingObstacle(Value):
         return replace(self, shape=shape, velocity=velocity, poses=poses)
 
 
-def track_speeds(times: Values, poses: Poses, radius: float) -> Float[ndarray, "intervals"]:
+def track_speeds(times: Values, poses: Poses, radius: float) -> Values:
     """Upper bounds on the speed between successive times [m/s], for points within `radius` [m] of the origin
     of the moving frame."""
     distances_between = step_lengths(poses[:, :3, 3])
@@ -593,7 +587,7 @@ def track_speeds(times: Values, poses: Poses, radius: float) -> Float[ndarray, "
     return (distances_between + radius * np.array(turns)) / np.diff(times)
 
 
-def _slerp(a: Float[ndarray, "4"], b: Float[ndarray, "4"], fraction: float) -> Float[ndarray, "4"]:
+def _slerp(a: Quaternion, b: Quaternion, fraction: float) -> Quaternion:
     """The unit quaternion at a fraction of the shorter rotation from a to b."""
     b = b if a @ b >= 0 else -b
     angle = 2 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b))

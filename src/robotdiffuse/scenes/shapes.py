@@ -21,6 +21,7 @@ from robotdiffuse.core.errors import (
     MAX_COORDINATE,
     MIN_SIZE,
     InputError,
+    filled_text,
     form,
     numbers,
     points,
@@ -32,6 +33,7 @@ from robotdiffuse.core.errors import (
 )
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import (
+    box_around,
     placed,
     quaternion_from_rotation,
     rotation_from_quaternion,
@@ -127,12 +129,6 @@ class Shape(Value, ABC):
 _vector = partial(vector, size=3)
 
 
-def _name(kind: str, name: str, value: object) -> object:
-    if not isinstance(value, str) or not value:
-        raise InputError(f"{kind}.name is {shown(value)}; it must be a non-empty string")
-    return value
-
-
 def _size(kind: str, name: str, value: object) -> ndarray:
     size = _vector(kind, name, value)
     if (size < MIN_SIZE).any():
@@ -158,7 +154,7 @@ CHECKS: dict[str, Callable[[str, str, Any], Any]] = {
     "points": points,
     "vertices": points,
     "point_radius": positive,
-    "name": _name,
+    "name": lambda kind, name, value: filled_text(f"{kind}.name", value, "a non-empty string"),
 }
 """Checks of shapes' fields, by name of the field. Each check takes the shape's kind, the field's name and its
 value. It returns the value to store, or raises InputError."""
@@ -388,8 +384,7 @@ class PointCloud(Shape):
     def bounds(self) -> Corners:
         if len(self.points) == 0:
             return read_only(np.zeros((2, 3)))
-        low = self.points.min(axis=0)
-        high = self.points.max(axis=0)
+        low, high = box_around(self.points)
         return read_only(np.stack([low - self.point_radius, high + self.point_radius]))
 
     def moved(self, T: Pose) -> "Shape":
@@ -421,8 +416,7 @@ class Triangulated(Shape):
 
     @property
     def bounds(self) -> Corners:
-        vertices = self.mesh.world_vertices
-        return np.stack([vertices.min(axis=0), vertices.max(axis=0)])
+        return box_around(self.mesh.world_vertices)
 
 
 @no_type_check

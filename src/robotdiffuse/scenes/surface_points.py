@@ -69,7 +69,7 @@ def draw(shape: Any, n: int, rng: Generator) -> ndarray:
 @draw.register
 def _sphere(shape: Sphere, n: int, rng: Generator) -> ndarray:
     directions = rng.standard_normal((n, 3))
-    directions *= (shape.radius / np.sqrt((directions * directions).sum(axis=1)))[:, None]
+    directions *= (shape.radius / np.linalg.norm(directions, axis=1))[:, None]
     return directions + shape.center
 
 
@@ -100,7 +100,7 @@ def _capsule(shape: Capsule, n: int, rng: Generator) -> ndarray:
     local = rng.standard_normal((n, 3))
     on_side = rng.random(n) * (shape.height + 2 * shape.radius) < shape.height
     local[on_side, 2] = 0
-    local *= (shape.radius / np.sqrt((local * local).sum(axis=1)))[:, None]
+    local *= (shape.radius / np.linalg.norm(local, axis=1))[:, None]
     along = np.where(on_side, rng.random(n) - 0.5, np.copysign(0.5, local[:, 2]))
     local[:, 2] += along * shape.height
     return local @ shape.rotation.T + shape.center
@@ -124,7 +124,7 @@ def sample_surface(
         return np.zeros((0, 3))
     areas = np.array([shape.area for shape in shapes])
     shares = areas / areas.sum()
-    batches: list[ndarray] = []
+    batches = list[ndarray]()
     missing = count
     sample_count = 2 * count
     for _ in range(MAX_SAMPLING_ROUNDS):

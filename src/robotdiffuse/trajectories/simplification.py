@@ -8,10 +8,8 @@ import numpy as np
 
 from robotdiffuse.collision.kernels.motions import distance, make_scratch, motion_free, path_length
 from robotdiffuse.collision.kernels.random import random
-from robotdiffuse.core.kernels import inner_kernel, kernel
+from robotdiffuse.core.kernels import HALF, ONE, inner_kernel, kernel
 
-_ONE = np.float32(1.0)
-_HALF = np.float32(0.5)
 MAX_SUBDIVISIONS = 5
 """Largest number of subdivisions in a round of corner smoothing."""
 MIN_MOVE = np.float32(0.005)
@@ -50,7 +48,7 @@ def simplify(space, path, rounds):
         if shorter >= length or not _free(space, smooth, scratch):
             break
         points = smooth
-        if shorter > length * (_ONE - MIN_GAIN):
+        if shorter > length * (ONE - MIN_GAIN):
             break
         length = shorter
     return points
@@ -120,13 +118,13 @@ def _smoothed(space, path, scratch):
         for i in range(len(points)):
             finer[2 * i] = points[i]
             if i > 0:
-                finer[2 * i - 1] = _HALF * (points[i - 1] + points[i])
+                finer[2 * i - 1] = HALF * (points[i - 1] + points[i])
         changed = False
         for i in range(2, len(finer) - 1, 2):
             moved = np.float32(0.0)
             for j in range(dof):
-                chord = _HALF * (finer[i - 1, j] + finer[i + 1, j])
-                trial[j] = _HALF * (finer[i, j] + chord)
+                chord = HALF * (finer[i - 1, j] + finer[i + 1, j])
+                trial[j] = HALF * (finer[i, j] + chord)
                 moved += (trial[j] - finer[i, j]) ** 2
             if moved < MIN_MOVE * MIN_MOVE:
                 continue
@@ -156,7 +154,7 @@ def _move(space, points, i, anywhere, scratch, state):
     far = MAX_RANDOM_MOVE * np.exp(-RANDOM_MOVE_LOG_RANGE * random(state)) if anywhere else np.float32(0.0)
     for j in range(points.shape[1]):
         chord = before[j] + share * (after[j] - before[j])
-        aside = far * (np.float32(2.0) * random(state) - _ONE)
+        aside = far * (np.float32(2.0) * random(state) - ONE)
         trial[j] = min(max(at[j] + pull * (chord - at[j]) + aside, space.lower[j]), space.upper[j])
     new1 = distance(before, trial)
     new2 = distance(trial, after)

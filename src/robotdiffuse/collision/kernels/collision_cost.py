@@ -22,32 +22,29 @@ from robotdiffuse.collision.kernels.lane_clearance import (
 from robotdiffuse.collision.kernels.lane_collision import in_axes, near_boxes, placed
 from robotdiffuse.collision.kernels.point_grid import near_point, points_lower_bound
 from robotdiffuse.collision.kernels.simd import W, first_lane, lane, load, load_vector, minimum, vector_in
-from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
+from robotdiffuse.core.kernels import HALF, ONE, ZERO, allocation_free, inner_kernel, kernel
 from robotdiffuse.robots.frame_kernel import cross, dot, length, minus, plus, times, write
 
 CLEARANCE_CAP = np.float32(1.0)
 """Larger clearances are capped at this value [m]."""
-_ZERO = np.float32(0.0)
-_HALF = np.float32(0.5)
-_ONE = np.float32(1.0)
 _TINY = np.float32(1e-9)
 
 
 @allocation_free(fastmath=True)
 def frames_of(robot, q, frames):
     """Writes frames[dof + 1, 12] (rotation row-major, translation) at q; frame 0 is the base."""
-    frames[0, :] = _ZERO
-    frames[0, 0] = frames[0, 4] = frames[0, 8] = _ONE
+    frames[0, :] = ZERO
+    frames[0, 0] = frames[0, 4] = frames[0, 8] = ONE
     for j in range(len(q)):
         parent = frames[parent_of(robot.parents, j)]
         child = frames[j + 1]
         offset = robot.offsets[j]
         c = np.cos(q[j])
         s = np.sin(q[j])
-        slide = _ZERO
-        if robot.offsets[j, 12] > _ZERO:
-            c = _ONE
-            s = _ZERO
+        slide = ZERO
+        if robot.offsets[j, 12] > ZERO:
+            c = ONE
+            s = ZERO
             slide = q[j]
         for k in range(3):
             row = parent[3 * k :]
@@ -68,31 +65,31 @@ def solid_distance(solid, p):
     c = abs(w) - solid[14]
     # outward normals (ou, ov) and (pu, pv) of the faces along the first two axes; a cylinder has only one,
     # which is radial
-    ou = np.copysign(_ONE, u)
-    ov = _ZERO
-    pu = _ZERO
-    pv = np.copysign(_ONE, v)
-    if solid[16] > _ZERO:
+    ou = np.copysign(ONE, u)
+    ov = ZERO
+    pu = ZERO
+    pv = np.copysign(ONE, v)
+    if solid[16] > ZERO:
         r = np.sqrt(u * u + v * v) + _TINY
         a = r - solid[12]
         b = -solid[12]
         ou = u / r
         ov = v / r
-    if a <= _ZERO and b <= _ZERO and c <= _ZERO:
+    if a <= ZERO and b <= ZERO and c <= ZERO:
         d = max(a, b, c)
-        na = _ZERO
-        nb = _ZERO
-        nc = _ZERO
+        na = ZERO
+        nb = ZERO
+        nc = ZERO
         if a >= b and a >= c:
-            na = _ONE
+            na = ONE
         elif b >= c:
-            nb = _ONE
+            nb = ONE
         else:
-            nc = _ONE
+            nc = ONE
     else:
-        a = max(a, _ZERO)
-        b = max(b, _ZERO)
-        c = max(c, _ZERO)
+        a = max(a, ZERO)
+        b = max(b, ZERO)
+        c = max(c, ZERO)
         d = np.sqrt(a * a + b * b + c * c) + _TINY
         na = a / d
         nb = b / d
@@ -110,7 +107,7 @@ def scene_distance(scene, p, limit):
     Distances to point clouds may be too large by a few millimeters.
     """
     best = limit
-    gradient = _ZERO, _ZERO, _ZERO
+    gradient = ZERO, ZERO, ZERO
     for k in range(len(scene.solids)):
         d, away = solid_distance(scene.solids[k], p)
         if d < best:
@@ -139,7 +136,7 @@ def _subtract_torques(robot, frames, frame, wrench, grad):
         j = frame - 1
         moved = frames[frame]
         frame = parent_of(robot.parents, j)
-        if robot.offsets[j, 12] > _ZERO:
+        if robot.offsets[j, 12] > ZERO:
             grad[j] -= dot(moved[2::3], wrench)
         else:
             grad[j] -= dot(moved[2::3], minus(wrench[3:], cross(moved[9:], wrench)))
@@ -149,13 +146,13 @@ def _subtract_torques(robot, frames, frame, wrench, grad):
 def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
     """Cost of a row of spheres of group g against the scene; adds the spheres' forces to `wrench`."""
     # obstacles near the row's bounding sphere
-    cost = _ZERO
+    cost = ZERO
     boxes = scene.solid_boxes
     bound = robot.row_bounds[row]
     center = placed(frame, bound)
     reach = bound[3] + margin
     any_close = 0
-    if reach <= _ZERO:  # a margin this negative turns the cost off
+    if reach <= ZERO:  # a margin this negative turns the cost off
         return cost
     for part in range(len(boxes)):
         any_close |= near_boxes(boxes, part, center, center, reach)
@@ -189,7 +186,7 @@ def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
             if d < lane(best, i):
                 pushed &= ~(1 << i)
                 h = lane(radius_and_margin, i) - d
-                cost += _HALF * h * h
+                cost += HALF * h * h
                 _add_force(wrench, at, times(h, gradient))
     pushed &= (1 << robot.row_sizes[row]) - 1
     while pushed:
@@ -197,8 +194,8 @@ def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
         pushed &= pushed - 1
         at = vector_in(centers, i)
         d, gradient = solid_distance(scene.solids[nearest[i]], at)
-        h = max(lane(radius_and_margin, i) - d, _ZERO)
-        cost += _HALF * h * h
+        h = max(lane(radius_and_margin, i) - d, ZERO)
+        cost += HALF * h * h
         _add_force(wrench, at, times(h, gradient))
     return cost
 
@@ -236,16 +233,16 @@ def cost_gradient_at(robot, scene, q, pair_distances, margin, self_margin, work,
     frames = work.frames
     wrench = work.wrench[0]
     opposite_wrench = work.wrench[1]
-    cost = _ZERO
+    cost = ZERO
     for g in range(len(robot.frame)):
         index = robot.frame[g]
         if index == 0:
             continue
-        wrench[:] = _ZERO
-        link_cost = _ZERO
+        wrench[:] = ZERO
+        link_cost = ZERO
         for row in range(robot.first_row[g], robot.first_row[g + 1]):
             link_cost += _row_cost(robot, scene, g, row, frames[index], margin, work.nearest, wrench)
-        if link_cost > _ZERO:
+        if link_cost > ZERO:
             cost += link_cost
             _subtract_torques(robot, frames, index, wrench, grad)
     for p in range(len(robot.pairs)):
@@ -257,8 +254,8 @@ def cost_gradient_at(robot, scene, q, pair_distances, margin, self_margin, work,
         ib = robot.frame[b]
         bound = robot.bounds[b]
         center = placed(frames[ib], bound)
-        wrench[:] = _ZERO
-        opposite_wrench[:] = _ZERO
+        wrench[:] = ZERO
+        opposite_wrench[:] = ZERO
         for s in range(robot.first[a], robot.first[a + 1]):
             sphere = robot.spheres[s]
             at = placed(frames[ia], sphere)
@@ -270,8 +267,8 @@ def cost_gradient_at(robot, scene, q, pair_distances, margin, self_margin, work,
                 offset = minus(at, partner)
                 d = length(offset) + _TINY
                 h = sphere[3] + other_sphere[3] + self_margin - d
-                if h > _ZERO:
-                    cost += _HALF * h * h
+                if h > ZERO:
+                    cost += HALF * h * h
                     _add_force(wrench, at, times(h / d, offset))
                     _add_force(opposite_wrench, partner, times(-h / d, offset))
         _subtract_torques(robot, frames, ia, wrench, grad)

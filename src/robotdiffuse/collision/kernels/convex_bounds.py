@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.frames import base_frames, parent_of, point_to_solid
+from robotdiffuse.collision.kernels.frames import base_frames, gap_to_solid, parent_of
 from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.robots.frame_kernel import (
     column,
@@ -145,8 +145,7 @@ def ball_to_solid(hulls, p, solids, o, posture):
     ball around the part [m]."""
     ball = hulls.balls[p]
     center = placed(posture.frames[hulls.frame[p]], ball)
-    gap = point_to_solid(center, solids.rotation[o], solids.middle[o], solids.half[o], solids.disc[o])
-    return gap - solids.rounding[o] - ball[3]
+    return gap_to_solid(center, solids, o) - ball[3]
 
 
 @inner_kernel(fastmath=True)

@@ -1,11 +1,11 @@
-"""Compiled kinematics: parents of frames, rotations of quaternions, and distances of points to solids."""
+"""Compiled kinematics: frames of arms, rotations of quaternions, and distances of points to solids."""
 
 import numpy as np
 from numba.core import types
 from numba.extending import overload
 
 from robotdiffuse.core.kernels import inner_kernel
-from robotdiffuse.robots.frame_kernel import dot, length, minus, write
+from robotdiffuse.robots.frame_kernel import dot, length, minus, step, write
 
 
 def parent_of(parents, j):
@@ -44,6 +44,20 @@ def point_to_solid(p, rotation, middle, half, disc):
         v = u
     outside = max(u, 0.0), 0.0 if disc > 0 else max(v, 0.0), max(w, 0.0)
     return length(outside) + min(max(u, v, w), 0.0)
+
+
+@inner_kernel()
+def gap_to_solid(p, solids, o):
+    """`point_to_solid` for obstacle o of `convex_bounds.Solids`, with its rounding [m]."""
+    distance = point_to_solid(p, solids.rotation[o], solids.middle[o], solids.half[o], solids.disc[o])
+    return distance - solids.rounding[o]
+
+
+@inner_kernel()
+def pose_arm(offsets, parents, slides, q, frames):
+    """Writes the frames T_base_frame[dof + 1, 3, 4] of an arm at q[dof]; frame 0 is given."""
+    for j in range(len(q)):
+        step(frames[parent_of(parents, j)], offsets[j], slides[j], q[j], frames[j + 1])
 
 
 @inner_kernel()

@@ -39,11 +39,9 @@ from robotdiffuse.collision.kernels.simd import (
     store_vector,
     vector_in,
 )
-from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
+from robotdiffuse.core.kernels import ONE, ZERO, allocation_free, inner_kernel, kernel
 from robotdiffuse.robots.frame_kernel import cross, dot, minus, plus, times
 
-_ZERO = np.float32(0.0)
-_ONE = np.float32(1.0)
 _TINY = np.float32(1e-9)
 _FAR = np.float32(1e9)
 
@@ -103,20 +101,20 @@ def to_solid(points, velocities, solid):
     # velocity in the solid's axes; multiplied by the sign of the coordinate, it is the speed away from the
     # center
     p, q, r = in_axes(solid, velocities)
-    r = r * copysign(_ONE, w)
-    if solid[16] > _ZERO:
+    r = r * copysign(ONE, w)
+    if solid[16] > ZERO:
         from_axis = sqrt(u * u + v * v)
         p = (u * p + v * q) / maximum(from_axis, _TINY)
         u = from_axis - solid[12]
-        v = minimum(u, _ZERO)  # u alone counts
+        v = minimum(u, ZERO)  # u alone counts
     else:
-        p = p * copysign(_ONE, u)
-        q = q * copysign(_ONE, v)
+        p = p * copysign(ONE, u)
+        q = q * copysign(ONE, v)
         u = absolute(u) - solid[12]
         v = absolute(v) - solid[13]
     w = absolute(w) - solid[14]
-    inside = minimum(maximum(maximum(u, v), w), _ZERO)
-    outside = maximum(u, _ZERO), maximum(v, _ZERO), maximum(w, _ZERO)
+    inside = minimum(maximum(maximum(u, v), w), ZERO)
+    outside = maximum(u, ZERO), maximum(v, ZERO), maximum(w, ZERO)
     d = _length(outside)
     return d + inside - solid[15], absolute(dot(outside, (p, q, r))) / maximum(d, _TINY)
 
@@ -153,8 +151,8 @@ def place_motions(robot, q, dq, work):
         z = load(work.frames, f, 2), load(work.frames, f, 5), load(work.frames, f, 8)
         axis = times(load(dq, j, 0), z)
         moment = cross(load_vector(work.frames, f, 9), axis)
-        moving = plus(times(_ONE - slides, moment), times(slides, axis))
-        turning = times(_ONE - slides, axis)
+        moving = plus(times(ONE - slides, moment), times(slides, axis))
+        turning = times(ONE - slides, axis)
         store_vector(work.twists, f, 0, plus(load_vector(work.twists, parent, 0), turning))
         store_vector(work.twists, f, 3, plus(load_vector(work.twists, parent, 3), moving))
 
@@ -197,7 +195,7 @@ def _mark_near(robot, scene, g, speed, work):
         # without a velocity
         distance, _ = to_solid(centers, minus(centers, centers), scene.solids[k])
         if len(scene.may_touch) and scene.may_touch[g, k]:
-            distance = distance * _ZERO + _FAR  # _FAR in all lanes
+            distance = distance * ZERO + _FAR  # _FAR in all lanes
         store(work.bounds, k, 0, distance)
         upper_bound = minimum(upper_bound, distance + radius)
     obstacles = solids
@@ -269,7 +267,7 @@ def pair_along(robot, p, swept, work):
     _place_group(robot, b, work)
     for s in range(robot.first[a], robot.first[a + 1]):
         centers = load_vector(work.positions, s, 0)
-        speed = _speed(twists, f, g, centers, _ZERO) if swept else still[0]
+        speed = _speed(twists, f, g, centers, ZERO) if swept else still[0]
         gap = _length(minus(centers, other_center)) - (spheres[s, 3] + bounds[b, 3])
         if (gap - speed < load(work.clearance, 0, 0)) == 0:
             continue
@@ -313,10 +311,10 @@ def block_pair_clearances(robot, q, limit, work, out):
         table = robot.pairs[p, 2]
         bit = robot.pairs[p, 3]
         separated_lanes = 0
-        if table >= 0 and reduce_min(load(work.clearance, 0, 0)) <= _ZERO:
+        if table >= 0 and reduce_min(load(work.clearance, 0, 0)) <= ZERO:
             separated_lanes = ~lanes_that_may_touch(robot, table, bit, q)
         for i in range(W):
-            separated = work.clearance[0, i] <= _ZERO and separated_lanes >> i & 1
+            separated = work.clearance[0, i] <= ZERO and separated_lanes >> i & 1
             out[p, i] = limit if separated else work.clearance[0, i]
 
 

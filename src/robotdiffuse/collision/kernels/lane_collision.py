@@ -36,20 +36,17 @@ from robotdiffuse.collision.kernels.simd import (
     store,
     store_vector,
 )
-from robotdiffuse.core.kernels import allocation_free, kernel
+from robotdiffuse.core.kernels import HALF, ONE, ZERO, allocation_free, kernel
 from robotdiffuse.robots.frame_kernel import dot, minus
 
 _INV_TAU = np.float32(0.15915494309189535)
 _QUARTER = np.float32(0.25)
-_HALF = np.float32(0.5)
 # in a table of `sphere_pair_tables.py`: how many numbers precede the cells, and the number of cells along
 # each of its two joints
 TABLE_HEADER = 6
 TABLE_SIDE = 130
 ALL_LANES = (1 << W) - 1
 """The mask of all lanes."""
-_ZERO = np.float32(0.0)
-_ONE = np.float32(1.0)
 # sin(2 pi u) for |u| <= 1/4: Taylor coefficients, error below 6e-8
 _S1 = np.float32(6.283185307179586)
 _S3 = np.float32(-41.341702240399755)
@@ -73,12 +70,12 @@ def _move(frames, parent, j, offset, q):
     prismatic joint."""
     value = load(q, j, 0)
     slide = value * offset[12]
-    if offset[12] > _ZERO:
-        s = value * _ZERO
-        c = s + _ONE
+    if offset[12] > ZERO:
+        s = value * ZERO
+        c = s + ONE
     else:
         turns = value * _INV_TAU
-        turns = turns - floor(turns + _HALF)
+        turns = turns - floor(turns + HALF)
         turned = absolute(turns)
         c = _sine_of_turn(_QUARTER - turned)
         s = copysign(_sine_of_turn(_QUARTER - absolute(turned - _QUARTER)), turns)
@@ -143,13 +140,13 @@ def _touching(centers, radius, solid):
     14 of the row are the half edges (of a cylinder: the radius twice, and the half height), entry 15 is the
     radius that is added, and entry 16 is 1 for a cylinder."""
     u, v, w = in_axes(solid, minus(centers, solid))
-    w = maximum(absolute(w) - solid[14], _ZERO)
+    w = maximum(absolute(w) - solid[14], ZERO)
     reach = radius + solid[15]
-    if solid[16] > _ZERO:
-        r = maximum(sqrt(u * u + v * v) - solid[12], _ZERO)
+    if solid[16] > ZERO:
+        r = maximum(sqrt(u * u + v * v) - solid[12], ZERO)
         return r * r + w * w < reach * reach
-    u = maximum(absolute(u) - solid[12], _ZERO)
-    v = maximum(absolute(v) - solid[13], _ZERO)
+    u = maximum(absolute(u) - solid[12], ZERO)
+    v = maximum(absolute(v) - solid[13], ZERO)
     return u * u + v * v + w * w < reach * reach
 
 
@@ -240,7 +237,7 @@ def _rows_touch(robot, row, f, other_row, other_f, i, work):
     other_centers = work.row
     store_vector(other_centers, 0, 0, _place_row(robot, other_row, work.frames, other_f, i))
     for t in range(W):
-        if _touching_balls(centers, radius + robot.rows[other_row, 3 * W + t], other_centers[0, t::W], _ZERO):
+        if _touching_balls(centers, radius + robot.rows[other_row, 3 * W + t], other_centers[0, t::W], ZERO):
             return True
     return False
 
@@ -252,9 +249,9 @@ def near_boxes(boxes, row, low, high, reach):
     above = minus(load_vector(boxes, row, 0), high)
     below = minus(low, load_vector(boxes, row, 3))
     d = (
-        maximum(maximum(above[0], below[0]), _ZERO),
-        maximum(maximum(above[1], below[1]), _ZERO),
-        maximum(maximum(above[2], below[2]), _ZERO),
+        maximum(maximum(above[0], below[0]), ZERO),
+        maximum(maximum(above[1], below[1]), ZERO),
+        maximum(maximum(above[2], below[2]), ZERO),
     )
     return dot(d, d) < reach * reach
 
@@ -303,8 +300,8 @@ def lanes_that_may_touch(robot, table, bit, q):
     row = robot.pair_tables[table]
     first = load(q, np.int32(row[0]), 0)
     second = load(q, np.int32(row[3]), 0)
-    i = minimum(maximum((first - row[1]) * row[2], _ZERO), np.float32(TABLE_SIDE - 1))
-    j = minimum(maximum((second - row[4]) * row[5], _ZERO), np.float32(TABLE_SIDE - 1))
+    i = minimum(maximum((first - row[1]) * row[2], ZERO), np.float32(TABLE_SIDE - 1))
+    j = minimum(maximum((second - row[4]) * row[5], ZERO), np.float32(TABLE_SIDE - 1))
     cells = gather(row, floor(i) * np.float32(TABLE_SIDE) + floor(j) + np.float32(TABLE_HEADER))
     return lanes_with_bit(cells, bit)
 

@@ -3,9 +3,9 @@ meshes' pieces; and the frames of an arm."""
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.frames import parent_of, point_to_solid
+from robotdiffuse.collision.kernels.frames import gap_to_solid, pose_arm
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.robots.frame_kernel import ball_gap, placed, step
+from robotdiffuse.robots.frame_kernel import ball_gap, placed
 
 
 @kernel()
@@ -14,12 +14,11 @@ def forward(offsets, parents, slides, q):
     for a chain) and slides[dof], which marks prismatic joints."""
     n, dof = q.shape
     frames = np.zeros((n, dof + 1, 4, 4))
+    frames[:, :, 3, 3] = 1.0
     for i in range(n):
-        for k in range(4):
+        for k in range(3):
             frames[i, 0, k, k] = 1.0
-        for j in range(dof):
-            frames[i, j + 1, 3, 3] = 1.0
-            step(frames[i, parent_of(parents, j)], offsets[j], slides[j], q[i, j], frames[i, j + 1])
+        pose_arm(offsets, parents, slides, q[i], frames[i])
     return frames
 
 
@@ -37,8 +36,7 @@ def scene_bounds(frames, frame, balls, solids, check):
         for p in range(len(balls)):
             center = placed(frames[i, frame], balls[p])
             for o in range(obstacles):
-                R, half = solids.rotation[o], solids.half[o]
-                gap = point_to_solid(center, R, solids.middle[o], half, solids.disc[o]) - solids.rounding[o]
+                gap = gap_to_solid(center, solids, o)
                 allowed = len(solids.may_touch) and solids.may_touch[check, o]
                 out[i, p * obstacles + o] = np.inf if allowed else gap - balls[p, 3]
     return out

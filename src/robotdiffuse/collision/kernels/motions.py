@@ -7,10 +7,8 @@ import numpy as np
 
 from robotdiffuse.collision.kernels.lane_collision import block_hits, make_workspace
 from robotdiffuse.collision.kernels.simd import W, lane_numbers, store
-from robotdiffuse.core.kernels import allocation_free, kernel
+from robotdiffuse.core.kernels import ONE, ZERO, allocation_free, kernel
 
-_ZERO = np.float32(0.0)
-_ONE = np.float32(1.0)
 RELAXATION_SLOPE = np.float32(0.1)
 """If a start or goal is closer to the scene than the padding, the padding is reduced at this configuration
 and grows by this much per radian of distance from it [m/rad]."""
@@ -85,7 +83,7 @@ def motion_free(space, a, b, scratch):
     Microseconds", ICRA 2024).
     """
     if len(space.near_ends) == 0:
-        return _stretch_free(space, a, b, np.float32(0.0), _ONE, space.padding, scratch)
+        return _stretch_free(space, a, b, np.float32(0.0), ONE, space.padding, scratch)
     length = distance(a, b)
     steps = max(int(np.ceil(length / RELAXATION_STEP)), 1)
     half = np.float32(0.5) * length / np.float32(steps)
@@ -120,7 +118,7 @@ def padding_near(space, a, b, share, around):
             d = np.float32(a[j] + share * (b[j] - a[j]) - space.near_ends[m, j])
             total += d * d
         padding = min(
-            padding, space.near_ends[m, dof] + RELAXATION_SLOPE * max(np.sqrt(total) - around, _ZERO)
+            padding, space.near_ends[m, dof] + RELAXATION_SLOPE * max(np.sqrt(total) - around, ZERO)
         )
     return padding
 

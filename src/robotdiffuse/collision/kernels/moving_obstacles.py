@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.frames import base_frames, parent_of, point_to_solid, write_rotation
+from robotdiffuse.collision.kernels.frames import base_frames, point_to_solid, pose_arm, write_rotation
 from robotdiffuse.collision.kernels.motion_pieces import Motion, configuration
 from robotdiffuse.core.kernels import inner_kernel, kernel
-from robotdiffuse.robots.frame_kernel import placed, plus, rotated_back, step, write
+from robotdiffuse.robots.frame_kernel import placed, plus, rotated_back, write
 
 CLEARANCE_CAP = 1.0
 """Larger clearances are capped at this value [m]."""
@@ -149,13 +149,6 @@ def _clearance(links, frames, link, tracks, o, rotation, box_center, enough):
 
 
 @inner_kernel()
-def _pose_arm(links, q, frames):
-    """Writes the frames T_base_frame[dof + 1, 3, 4] at q[dof]."""
-    for j in range(len(q)):
-        step(frames[parent_of(links.parents, j)], links.offsets[j], links.slides[j], q[j], frames[j + 1])
-
-
-@inner_kernel()
 def cumulative_motion(q):
     """Total motion of each joint from the first row to each row [n, dof]; motion in both directions adds
     up."""
@@ -217,7 +210,7 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
             configuration(joint_travel, start, travel_at_start)
             configuration(joint_travel, time, travel_in_middle)
             configuration(joint_travel, stop, travel_at_stop)
-            _pose_arm(links, middle, frames)
+            pose_arm(links.offsets, links.parents, links.slides, middle, frames)
             # largest motion of each link from the middle to either end
             travel[:] = 0.0
             for j in range(dof):
@@ -284,7 +277,7 @@ def free_at_times(links, tracks, q, times, least):
         for k in range(len(times)):
             pose_at(tracks, o, times[k], rotations[o, k], centers[o, k])
     for i in range(len(q)):
-        _pose_arm(links, q[i], frames)
+        pose_arm(links.offsets, links.parents, links.slides, q[i], frames)
         for link in range(count):
             for o in range(obstacles):
                 k = 0

@@ -30,16 +30,13 @@ from robotdiffuse.collision.kernels.simd import (
     sqrt,
     vector_in,
 )
-from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
+from robotdiffuse.core.kernels import HALF, ONE, ZERO, allocation_free, inner_kernel, kernel
 from robotdiffuse.robots.frame_kernel import dot, length, minus, plus, times, write
 
 POINT_RANGE = np.float32(0.3)
 """Points farther than this beyond the robot's reach are left out; clearances to points are capped at this
 value [m]."""
-_ZERO = np.float32(0.0)
-_ONE = np.float32(1.0)
-_HALF = np.float32(0.5)
-_MIDDLE = _HALF, _HALF, _HALF
+_MIDDLE = HALF, HALF, HALF
 _TINY = np.float32(1e-9)
 # Upper bound on the rounding error of a distance within the grid [m]
 _SLACK = np.float32(1e-5)
@@ -74,9 +71,9 @@ def make_grid(points, starts, run, low, voxel, shape, band, known):
                 nearest[v] = starts[b]
                 if lower >= band:
                     continue
-                cx = low[0] + (np.float32(i) + _HALF) * voxel
-                cy = low[1] + (np.float32(j) + _HALF) * voxel
-                cz = low[2] + (np.float32(k) + _HALF) * voxel
+                cx = low[0] + (np.float32(i) + HALF) * voxel
+                cy = low[1] + (np.float32(j) + HALF) * voxel
+                cz = low[2] + (np.float32(k) + HALF) * voxel
                 best = band * band
                 for p in range(starts[b], starts[b + 1]):
                     dx = points[p, 0] - cx
@@ -97,7 +94,7 @@ def _balls(points, starts):
     balls = np.zeros((len(starts) - 1, 4), np.float32)
     for b in range(len(balls)):
         ball = balls[b]
-        share = _ONE / np.float32(starts[b + 1] - starts[b])
+        share = ONE / np.float32(starts[b + 1] - starts[b])
         for p in range(starts[b], starts[b + 1]):
             write(plus(ball, times(share, points[p])), ball)
         for p in range(starts[b], starts[b + 1]):
@@ -108,12 +105,12 @@ def _balls(points, starts):
 @inner_kernel(fastmath=True)
 def _max_offset(points, low, voxel):
     """Largest distance of a point from the center of its voxel [m]."""
-    max_square = _ZERO
+    max_square = ZERO
     for p in range(len(points)):
-        square = _ZERO
+        square = ZERO
         for axis in range(3):
             coordinate = (points[p, axis] - low[axis]) / voxel
-            off = coordinate - np.floor(coordinate) - _HALF
+            off = coordinate - np.floor(coordinate) - HALF
             square += off * off
         max_square = max(max_square, square)
     return voxel * np.sqrt(max_square) + _SLACK
@@ -140,11 +137,11 @@ def _settle(points, starts, balls, low, voxel, shape, band, distances, nearest):
         k0 = max(int(pz - span), 0)
         k1 = min(int(pz + span) + 1, nz)
         n = np.int32(k1 - k0)
-        first_z = np.float32(k0) + _HALF
+        first_z = np.float32(k0) + HALF
         for i in range(i0, i1):
-            cx = low[0] + (np.float32(i) + _HALF) * voxel
+            cx = low[0] + (np.float32(i) + HALF) * voxel
             for j in range(j0, j1):
-                cy = low[1] + (np.float32(j) + _HALF) * voxel
+                cy = low[1] + (np.float32(j) + HALF) * voxel
                 across = (cx - x) * (cx - x) + (cy - y) * (cy - y)
                 row = (i * ny + j) * nz + k0
                 if across >= reach * reach or not _any_closer(
@@ -194,11 +191,11 @@ def _ask_grid(centers, radius, scene):
     frame = scene.grid_frame
     band = frame[7]
     voxel = frame[3]
-    f = times(_ONE / voxel, minus(centers, frame))
+    f = times(ONE / voxel, minus(centers, frame))
     c = (
-        minimum(maximum(f[0], _ZERO), frame[8] - _HALF),
-        minimum(maximum(f[1], _ZERO), frame[9] - _HALF),
-        minimum(maximum(f[2], _ZERO), frame[10] - _HALF),
+        minimum(maximum(f[0], ZERO), frame[8] - HALF),
+        minimum(maximum(f[1], ZERO), frame[9] - HALF),
+        minimum(maximum(f[2], ZERO), frame[10] - HALF),
     )
     i = floor(c[0]), floor(c[1]), floor(c[2])
     g = gather(scene.grid, (i[0] * frame[9] + i[1]) * frame[10] + i[2])
@@ -206,7 +203,7 @@ def _ask_grid(centers, radius, scene):
     from_center = sqrt(dot(e, e)) * voxel
     o = minus(f, c)
     out = dot(o, o) * (voxel * voxel)
-    grid_distance = maximum(g - from_center, _ZERO)
+    grid_distance = maximum(g - from_center, ZERO)
     touch_distance = radius + (frame[5] + _SLACK)
     near = grid_distance * grid_distance + out < touch_distance * touch_distance
     touching = (g + from_center + sqrt(out) < radius + (frame[6] - _SLACK)) & (g < band)
@@ -217,8 +214,8 @@ def _ask_grid(centers, radius, scene):
 def far_from_points(scene, low, high, radius):
     """Whether one look-up, in the middle of the box from `low` to `high`, shows that no sphere of this radius
     with its center in the box touches a point."""
-    lower = points_lower_bound(scene, times(_HALF, plus(low, high)))
-    return lower > radius + _HALF * length(minus(high, low)) + _SLACK
+    lower = points_lower_bound(scene, times(HALF, plus(low, high)))
+    return lower > radius + HALF * length(minus(high, low)) + _SLACK
 
 
 @allocation_free()
@@ -235,14 +232,14 @@ def _near_by_eight(centers, radius, scene):
     the sphere's center, as seen from this point, is almost exact.
     """
     frame = scene.grid_frame
-    x, y, z = times(_ONE / frame[3], minus(centers, frame))
-    fx = minimum(maximum(x, _ZERO), frame[8] - _HALF)
-    fy = minimum(maximum(y, _ZERO), frame[9] - _HALF)
-    fz = minimum(maximum(z, _ZERO), frame[10] - _HALF)
-    lx = minimum(floor(maximum(fx - _HALF, _ZERO)), frame[8] - np.float32(2.0))
-    ly = minimum(floor(maximum(fy - _HALF, _ZERO)), frame[9] - np.float32(2.0))
-    lz = minimum(floor(maximum(fz - _HALF, _ZERO)), frame[10] - np.float32(2.0))
-    bound = fx * _ZERO
+    x, y, z = times(ONE / frame[3], minus(centers, frame))
+    fx = minimum(maximum(x, ZERO), frame[8] - HALF)
+    fy = minimum(maximum(y, ZERO), frame[9] - HALF)
+    fz = minimum(maximum(z, ZERO), frame[10] - HALF)
+    lx = minimum(floor(maximum(fx - HALF, ZERO)), frame[8] - np.float32(2.0))
+    ly = minimum(floor(maximum(fy - HALF, ZERO)), frame[9] - np.float32(2.0))
+    lz = minimum(floor(maximum(fz - HALF, ZERO)), frame[10] - np.float32(2.0))
+    bound = fx * ZERO
     for corner in range(8):
         ix = lx + np.float32(corner >> 2)
         iy = ly + np.float32((corner >> 1) & 1)
@@ -291,10 +288,10 @@ def _in_column(scene, i, j, rx, ry, rz, reach):
     cell = frame[4]
     my = int(frame[12])
     mz = int(frame[13])
-    gx = max(max(np.float32(i) * cell - rx, rx - np.float32(i + 1) * cell), _ZERO)
-    gy = max(max(np.float32(j) * cell - ry, ry - np.float32(j + 1) * cell), _ZERO)
+    gx = max(max(np.float32(i) * cell - rx, rx - np.float32(i + 1) * cell), ZERO)
+    gy = max(max(np.float32(j) * cell - ry, ry - np.float32(j + 1) * cell), ZERO)
     squared_half = reach * reach - gx * gx - gy * gy
-    if squared_half <= _ZERO:
+    if squared_half <= ZERO:
         return np.int32(0), np.int32(0)
     half = np.sqrt(squared_half) + _SLACK
     k0 = max(int((rz - half) / cell), 0)
@@ -314,7 +311,7 @@ def _touches(scene, at, radius):
     if p >= 0 and length(minus(scene.points[p], at)) < radius + scene.points[p, 3]:
         return True
     reach = radius + frame[5] + _SLACK
-    if reach <= _ZERO:
+    if reach <= ZERO:
         return False
     rx, ry, rz = minus(at, frame)
     i0, i1, j0, j1 = _columns(frame, rx, ry, reach)
@@ -337,16 +334,16 @@ def _look_up(scene, at):
     the voxel."""
     frame = scene.grid_frame
     voxel = frame[3]
-    f = times(_ONE / voxel, minus(at, frame))
+    f = times(ONE / voxel, minus(at, frame))
     c = (
-        min(max(f[0], _ZERO), frame[8] - _HALF),
-        min(max(f[1], _ZERO), frame[9] - _HALF),
-        min(max(f[2], _ZERO), frame[10] - _HALF),
+        min(max(f[0], ZERO), frame[8] - HALF),
+        min(max(f[1], ZERO), frame[9] - HALF),
+        min(max(f[2], ZERO), frame[10] - HALF),
     )
     i = np.int32(c[0]), np.int32(c[1]), np.int32(c[2])
     index = (i[0] * np.int32(frame[9]) + i[1]) * np.int32(frame[10]) + i[2]
     e = minus(minus(c, (np.float32(i[0]), np.float32(i[1]), np.float32(i[2]))), _MIDDLE)
-    grid_distance = max(scene.grid[index] - voxel * length(e), _ZERO)
+    grid_distance = max(scene.grid[index] - voxel * length(e), ZERO)
     out = voxel * length(minus(f, c))
     return np.sqrt(grid_distance * grid_distance + out * out) - frame[5] - _SLACK, scene.nearest[index]
 
@@ -358,7 +355,7 @@ def _search(scene, at, limit):
     frame = scene.grid_frame
     reach = limit + frame[5] + _SLACK
     best = limit
-    if reach <= _ZERO:
+    if reach <= ZERO:
         return best
     rx, ry, rz = minus(at, frame)
     i0, i1, j0, j1 = _columns(frame, rx, ry, reach)
@@ -369,10 +366,10 @@ def _search(scene, at, limit):
                 offset = minus(points[p], at)
                 r = best + points[p, 3]
                 square = dot(offset, offset)
-                if r > _ZERO and square < r * r:
+                if r > ZERO and square < r * r:
                     best = np.sqrt(square) - points[p, 3]
             reach = best + frame[5] + _SLACK
-            if reach <= _ZERO:
+            if reach <= ZERO:
                 return best
     return best
 
@@ -407,7 +404,7 @@ def near_point(scene, at, limit):
     large by a few millimeters at most. It is used for gradients, where an exact search would take too long.
     """
     best = limit
-    gradient = _ZERO, _ZERO, _ZERO
+    gradient = ZERO, ZERO, ZERO
     if points_lower_bound(scene, at) >= limit:
         return best, gradient
     frame = scene.grid_frame
@@ -415,7 +412,7 @@ def near_point(scene, at, limit):
     nx = int(frame[8])
     ny = int(frame[9])
     nz = int(frame[10])
-    fx, fy, fz = minus(times(_ONE / frame[3], minus(at, frame)), _MIDDLE)
+    fx, fy, fz = minus(times(ONE / frame[3], minus(at, frame)), _MIDDLE)
     i = min(max(int(np.floor(fx)), 0), nx - 2)
     j = min(max(int(np.floor(fy)), 0), ny - 2)
     k = min(max(int(np.floor(fz)), 0), nz - 2)
@@ -430,5 +427,5 @@ def near_point(scene, at, limit):
         d = length(offset) + _TINY
         if d - points[p, 3] < best:
             best = d - points[p, 3]
-            gradient = times(_ONE / d, offset)
+            gradient = times(ONE / d, offset)
     return best, gradient

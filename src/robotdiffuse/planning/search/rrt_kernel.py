@@ -19,11 +19,8 @@ import numpy as np
 from robotdiffuse.collision.kernels.motions import distance, make_scratch, motion_free
 from robotdiffuse.collision.kernels.random import random
 from robotdiffuse.collision.kernels.simd import W, lane, load
-from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
+from robotdiffuse.core.kernels import HALF, ONE, ZERO, allocation_free, inner_kernel, kernel
 
-_ZERO = np.float32(0.0)
-_ONE = np.float32(1.0)
-_HALF = np.float32(0.5)
 _TAU = np.float32(6.283185307179586)
 INFINITE = np.float32(np.inf)
 # Coordinate of unused node places, far from all nodes; its square is finite [rad]
@@ -73,9 +70,9 @@ def make_trees(start, goals, capacity):
         np.empty((2, capacity), np.int32),
         np.zeros(2, np.int32),
     )
-    add(trees, 0, start, _ZERO, -1)
+    add(trees, 0, start, ZERO, -1)
     for goal in goals:
-        add(trees, 1, goal, _ZERO, -1)
+        add(trees, 1, goal, ZERO, -1)
     return trees
 
 
@@ -99,7 +96,7 @@ def extended_straight(space, trees, tree, near, q, longest, bound, scratch):
     origin = trees.nodes[tree, near]
     end = scratch.a
     gap = distance(origin, q)
-    share = _ONE if gap <= longest else longest / gap
+    share = ONE if gap <= longest else longest / gap
     for j in range(len(end)):
         end[j] = q[j] if gap <= longest else origin[j] + share * (q[j] - origin[j])
     cost = trees.costs[tree, near] + share * gap
@@ -296,7 +293,7 @@ def nearest(trees, tree, q, c_rand):
             # slack, the cost that remains for the edge, must be at least the edge's length
             slack = c_rand - load(trees.costs, tree, part)
             total = square + slack * slack
-            nearer = (total < best) & ~(slack < _ZERO) & ~(slack * slack < square)
+            nearer = (total < best) & ~(slack < ZERO) & ~(slack * slack < square)
         else:
             total = square
             nearer = total < best
@@ -402,12 +399,12 @@ def goal_shares(start, goals, bound):
     """Cumulative fractions of the samples for each goal [goals], proportional to the volumes of the
     hyperspheroids of paths shorter than `bound`."""
     shares = np.empty(len(goals), np.float32)
-    total = _ZERO
+    total = ZERO
     for g in range(len(goals)):
         c_min = distance(start, goals[g])
         if c_min < bound:
             # ratio of the short axes to the long one
-            flatness = np.sqrt(_ONE - (c_min / bound) ** 2)
+            flatness = np.sqrt(ONE - (c_min / bound) ** 2)
             total += flatness ** np.float32(len(start) - 1)
         shares[g] = total
     return shares / max(total, np.float32(1e-30))
@@ -420,27 +417,27 @@ def sample_within(space, start, goal, bound, q, state):
     dof = len(q)
     c_min = distance(start, goal)
     # L: half axes c_max / 2 and sqrt(c_max^2 - c_min^2) / 2
-    half_axis = _HALF * np.sqrt(max(bound * bound - c_min * c_min, _ZERO))
+    half_axis = HALF * np.sqrt(max(bound * bound - c_min * c_min, ZERO))
     # SampleUnitNBall: a normal direction, and a radius u^(1/n)
-    norm = _ZERO
+    norm = ZERO
     for j in range(dof):
         q[j] = _normal(state)
         norm += q[j] * q[j]
-    scale = random(state) ** (_ONE / np.float32(dof)) / np.sqrt(max(norm, np.float32(1e-12)))
+    scale = random(state) ** (ONE / np.float32(dof)) / np.sqrt(max(norm, np.float32(1e-12)))
     for j in range(dof):
-        q[j] *= scale * (_HALF * bound if j == 0 else half_axis)
+        q[j] *= scale * (HALF * bound if j == 0 else half_axis)
     # C, the rotation to the world frame, is a Householder reflection of the first axis onto the goal's
     # direction; the center is halfway
-    along = _ZERO
-    total = _ZERO
+    along = ZERO
+    total = ZERO
     for j in range(dof):
-        v = (_ONE if j == 0 else _ZERO) - (goal[j] - start[j]) / max(c_min, np.float32(1e-9))
+        v = (ONE if j == 0 else ZERO) - (goal[j] - start[j]) / max(c_min, np.float32(1e-9))
         along += v * q[j]
         total += v * v
     for j in range(dof):
-        v = (_ONE if j == 0 else _ZERO) - (goal[j] - start[j]) / max(c_min, np.float32(1e-9))
-        turned = q[j] - (np.float32(2.0) * along / total * v if total > np.float32(1e-9) else _ZERO)
-        q[j] = min(max(turned + _HALF * (start[j] + goal[j]), space.lower[j]), space.upper[j])
+        v = (ONE if j == 0 else ZERO) - (goal[j] - start[j]) / max(c_min, np.float32(1e-9))
+        turned = q[j] - (np.float32(2.0) * along / total * v if total > np.float32(1e-9) else ZERO)
+        q[j] = min(max(turned + HALF * (start[j] + goal[j]), space.lower[j]), space.upper[j])
 
 
 @allocation_free()

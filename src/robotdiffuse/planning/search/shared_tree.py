@@ -39,7 +39,7 @@ from robotdiffuse.collision.kernels.motions import (
     path_length,
 )
 from robotdiffuse.collision.kernels.random import random, random_state
-from robotdiffuse.core.kernels import allocation_free, kernel
+from robotdiffuse.core.kernels import ONE, ZERO, allocation_free, kernel
 from robotdiffuse.core.settings import Count, NotNegative, Positive, Settings
 from robotdiffuse.core.types import Configuration, Configurations, PlanResult, Values
 from robotdiffuse.planning.context import PlanningContext
@@ -49,8 +49,6 @@ from robotdiffuse.planning.search.rrt_kernel import INFINITE, add, nearest_few, 
 from robotdiffuse.planning.start_goal import StartGoal, falling_clearances, padded_space
 from robotdiffuse.trajectories.simplification import simplify, tighten
 
-_ZERO = np.float32(0.0)
-_ONE = np.float32(1.0)
 CAPACITY = 500_000
 """Largest number of nodes of the tree. The operating system allocates their memory only when it is used."""
 GOAL_BIAS = np.float32(0.1)
@@ -106,7 +104,7 @@ def _best_cost(trees, goals):
 @allocation_free()
 def _is_open(goals, g, best):
     """Whether a path to the goal might still be shorter than the best one to any goal."""
-    return goals.bound[g] < best * (_ONE - GAIN)
+    return goals.bound[g] < best * (ONE - GAIN)
 
 
 @allocation_free(inner=False)
@@ -119,7 +117,7 @@ def draw_goal(trees, goals, state):
     promise.
     """
     best = _best_cost(trees, goals)
-    total = _ZERO
+    total = ZERO
     chosen = -1
     for g in range(len(goals.at)):
         if not _is_open(goals, g, best):
@@ -129,10 +127,10 @@ def draw_goal(trees, goals, state):
             # a goal without a path, or with a long one, counts as reached at 1.5 times the best cost
             cost = min(_goal_cost(trees, goals, g), np.float32(1.5) * best)
             hope = best - bound - REMAINING_EXCESS * (cost - bound)
-            promise = max(hope / best, _ZERO) + MIN_PROMISE
+            promise = max(hope / best, ZERO) + MIN_PROMISE
         else:
-            promise = _ONE / (bound * bound + np.float32(0.1))
-        promise /= _ONE + goals.failures[g]
+            promise = ONE / (bound * bound + np.float32(0.1))
+        promise /= ONE + goals.failures[g]
         total += promise
         # reservoir sampling: one pass and no array of promises
         if random(state) * total < promise:
@@ -189,7 +187,7 @@ def add_node(space, trees, goals, q, scratch, index, gaps):
         chosen = -1
         cost = INFINITE
         for i in range(count):
-            if gaps[i] >= _ZERO and costs[index[i]] + gaps[i] < cost:
+            if gaps[i] >= ZERO and costs[index[i]] + gaps[i] < cost:
                 chosen = i
                 cost = costs[index[i]] + gaps[i]
         # no edge is free, q cannot improve a path, or q is a copy of a node
@@ -198,13 +196,13 @@ def add_node(space, trees, goals, q, scratch, index, gaps):
         parent = index[chosen]
         if motion_free(space, nodes[parent], q, scratch):
             break
-        gaps[chosen] = -_ONE - gaps[chosen]
+        gaps[chosen] = -ONE - gaps[chosen]
     node = add(trees, 0, q, cost, parent)
     # rewire: x_new becomes the parent of the near nodes that it reaches more cheaply
     for i in range(count):
         near = index[i]
         through = cost + gaps[i]
-        if gaps[i] < _ZERO or near == parent or through >= costs[near] * (_ONE - GAIN):
+        if gaps[i] < ZERO or near == parent or through >= costs[near] * (ONE - GAIN):
             continue
         if motion_free(space, q, nodes[near], scratch):
             rewire(trees, 0, near, node, through)
@@ -229,7 +227,7 @@ def _try_goals(space, trees, goals, node, drawn, longest, scratch):
         gap = distance(trees.nodes[0, node], goals.at[g])
         cost = trees.costs[0, node] + gap
         # a goal gets its own first path even if another goal's path is shorter
-        if (g != drawn and gap > longest) or cost >= _goal_cost(trees, goals, g) * (_ONE - GAIN):
+        if (g != drawn and gap > longest) or cost >= _goal_cost(trees, goals, g) * (ONE - GAIN):
             continue
         if motion_free(space, trees.nodes[0, node], goals.at[g], scratch):
             _reach(trees, goals, g, node, cost)
@@ -258,7 +256,7 @@ def _grow(space, trees, goals, longest, iterations, state, scratch, index, gaps)
         _draw(space, trees, goals, g, state, x_rand)
         x_nearest = trees.nodes[0, rrt_kernel.nearest(trees, 0, x_rand, INFINITE)]
         # Steer
-        share = min(longest / max(distance(x_nearest, x_rand), np.float32(1e-6)), _ONE)
+        share = min(longest / max(distance(x_nearest, x_rand), np.float32(1e-6)), ONE)
         for j in range(len(x_new)):
             x_new[j] = x_nearest[j] + share * (x_rand[j] - x_nearest[j])
         node = add_node(space, trees, goals, x_new, scratch, index, gaps)
@@ -270,12 +268,12 @@ def _grow(space, trees, goals, longest, iterations, state, scratch, index, gaps)
 def graft(trees, goals, path, g):
     """Add a free path from the start to goal g as a branch if no path to this goal is as short, and if there
     is room in the tree."""
-    if path_length(path) >= _goal_cost(trees, goals, g) * (_ONE - GAIN):
+    if path_length(path) >= _goal_cost(trees, goals, g) * (ONE - GAIN):
         return
     if trees.sizes[0] + len(path) >= trees.nodes.shape[1]:
         return
     node = 0
-    cost = _ZERO
+    cost = ZERO
     for i in range(1, len(path) - 1):
         cost += distance(path[i - 1], path[i])
         node = add(trees, 0, path[i], cost, node)

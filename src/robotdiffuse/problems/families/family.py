@@ -5,23 +5,26 @@ from dataclasses import replace
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Natural, Positive, Settings
-from robotdiffuse.core.transforms import moved_spheres
-from robotdiffuse.core.types import Configuration, Configurations, JointRows, Mask, Pose, frozen_dataclass
+from robotdiffuse.core.types import (
+    Configuration,
+    Configurations,
+    JointRows,
+    Mask,
+    Pose,
+    Spheres,
+    frozen_dataclass,
+)
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Sphere
+from robotdiffuse.scenes.shapes import Box, Corners, Sphere
 
-Spheres = Float[ndarray, "_ 4"]
-"""x, y, z, radius [m]."""
 Range = tuple[float, float]
 PositiveRange = tuple[Positive, Positive]
 NaturalRange = tuple[Natural, Natural]
@@ -151,7 +154,7 @@ def sample_until_found(
 
 
 def uniform_configurations(
-    robot: Robot, region: Float[ndarray, "2 3"], checker: CollisionChecker, count: int, rng: Generator
+    robot: Robot, region: Corners, checker: CollisionChecker, count: int, rng: Generator
 ) -> JointRows:
     """Up to `count` collision-free configurations with the origin of the tip link in the region.
 
@@ -220,8 +223,7 @@ def between_targets(
 def base_spheres(robot: Robot) -> Spheres:
     """Collision spheres (x, y, z, radius) of the links that no planned joint moves, in the base frame [m]."""
     fixed = [link for link in robot.spheres if robot.link_frame(link) == 0]
-    parts = [moved_spheres(robot.T_frame_link(link), robot.spheres[link]) for link in fixed]
-    return np.concatenate([np.zeros((0, 4)), *parts])
+    return np.concatenate([np.zeros((0, 4)), *map(robot.frame_spheres, fixed)])
 
 
 def is_clear_of(shape: Sphere | Box, keep_out: Spheres | None) -> bool:

@@ -199,8 +199,8 @@ class FurnitureFrame:
     """A piece of furniture in its frame: x points away from the arm, y to the left, z up from the ground."""
 
     def __init__(self, settings: Furniture, distance: Range, rng: Generator) -> None:
-        self.shapes: list[Box | Sphere] = []
-        self.regions: list[Region] = []
+        self.shapes = list[Box | Sphere]()
+        self.regions = list[Region]()
         bearing = rng.uniform(*settings.bearing)
         away = rng.uniform(*distance)
         self.yaw = float(bearing + rng.uniform(*settings.turn))
@@ -461,8 +461,8 @@ class Crate(Furniture):
         return 6 * self.crates[1] + self.objects[1]
 
     def build(self, rng: Generator) -> Sequence[FurnitureFrame]:
-        frames: list[FurnitureFrame] = []
-        occupied: list[Rectangle] = []
+        frames = list[FurnitureFrame]()
+        occupied = list[Rectangle]()
 
         def place(half: float) -> FurnitureFrame:
             """The frame of a new object of this half width, at a free place that is then marked as taken."""
@@ -772,7 +772,7 @@ class Cabinet(Furniture):
         frame.case(depth, t, low, height, boards, sides)
         if rng.random() < self.back_share:
             frame.box((depth, right, low), (depth + t, left, height), "back")
-        regions: list[tuple[Corner, Corner, Vector]] = []
+        regions = list[tuple[Corner, Corner, Vector]]()
         if not on_ground and rng.random() < self.legs_share:
             w = 2 * t
             for x in (0.0, depth - w):

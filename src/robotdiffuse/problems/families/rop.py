@@ -4,8 +4,6 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.collision import CollisionChecker
@@ -31,7 +29,7 @@ from robotdiffuse.problems.families.family import (
 )
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import IDENTITY, Box, Sphere
+from robotdiffuse.scenes.shapes import IDENTITY, Box, Corners, Sphere
 
 KINDS = ("sphere", "box")
 FLOOR = Box((0.0, 0.0, -0.05), (2.0, 2.0, 0.1), name="floor")
@@ -75,7 +73,7 @@ class Rop(Ranges):
         return FLOOR
 
     @property
-    def region(self) -> Float[ndarray, "2 3"]:
+    def region(self) -> Corners:
         return np.array([self.tip_x, self.tip_y, self.tip_z]).T
 
     @property

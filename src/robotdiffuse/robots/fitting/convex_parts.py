@@ -20,7 +20,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.transforms import scaled_normals
+from robotdiffuse.core.transforms import box_around, scaled_normals
 from robotdiffuse.core.types import Points, Values, Vector
 from robotdiffuse.robots.bodies import ConvexMesh, Surface
 from robotdiffuse.robots.fitting.triangles import Triangles, split
@@ -54,7 +54,7 @@ def thickened(points: Points) -> Points:
 
 def face_normals(mesh: ConvexMesh) -> Points:
     """Outward unit normals of the faces that have an area."""
-    normals = scaled_normals(mesh.vertices[mesh.faces])
+    normals = scaled_normals(mesh.triangles)
     size = np.linalg.norm(normals, axis=1, keepdims=True)
     return (normals / np.maximum(size, 1e-14))[size[:, 0] > 1e-14]
 
@@ -94,9 +94,7 @@ class DistanceGrid(NamedTuple):
     @staticmethod
     def around(soups: list[Triangles], voxels: int, finest: float) -> "DistanceGrid":
         """A grid around triangles with about `voxels` voxels. Their edge is at least `finest` [m]."""
-        corners = np.concatenate(soups).reshape(-1, 3)
-        low = corners.min(0)
-        high = corners.max(0)
+        low, high = box_around(np.concatenate(soups).reshape(-1, 3))
         size = np.maximum(high - low, finest)
         pitch = max(float(np.prod(size) / voxels) ** (1 / 3), size.max() / 300, finest)
         origin = low - 2.5 * pitch

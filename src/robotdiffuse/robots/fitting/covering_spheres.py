@@ -14,8 +14,8 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial import ConvexHull, QhullError
 
-from robotdiffuse.core.transforms import ball_around, inverse, moved_spheres, placed
-from robotdiffuse.core.types import Points, Rotation, Spheres, Values, Vector
+from robotdiffuse.core.transforms import ball_around, box_around, inverse, moved_spheres, placed
+from robotdiffuse.core.types import NO_SPHERES, Points, Rotation, Spheres, Values, Vector
 from robotdiffuse.robots.bodies import AttachedBody, ConvexMesh
 from robotdiffuse.robots.fitting.sphere_fitting import MARGIN, SphereSettings
 
@@ -37,8 +37,7 @@ def cover(mesh: ConvexMesh) -> Spheres:
     """Spheres [x y z radius, m] that cover surface and interior of a convex mesh."""
     axes = _axes(mesh.vertices)
     vertices = mesh.vertices @ axes.T
-    low = vertices.min(axis=0)
-    high = vertices.max(axis=0)
+    low, high = box_around(vertices)
     half_width = float((high - low).min()) / 2  # at least the radius of the largest inscribed sphere
     tolerance = LINK_TOLERANCES.tolerance(*HAND, half_width)
     bounding = _around(vertices)
@@ -118,7 +117,7 @@ def body_geometry(body: AttachedBody) -> tuple[tuple[ConvexMesh, ...], Spheres]:
     """Convex meshes of a body and spheres [x y z radius, m] that cover them, in the body's frame."""
     T_body_link = inverse(body.T_link_body)
     meshes = list[ConvexMesh]()
-    spheres: list[ndarray] = [np.zeros((0, 4))]
+    spheres: list[ndarray] = [NO_SPHERES]
     for shape in body.shapes:
         T_link_shape, parts = shape.solid()
         T = T_body_link @ T_link_shape

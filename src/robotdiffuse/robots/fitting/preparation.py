@@ -24,7 +24,7 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, check_name, joined, shown
 from robotdiffuse.core.files import lock_folder
 from robotdiffuse.core.transforms import seen_from
-from robotdiffuse.core.types import Mask, Points, Poses, Spheres
+from robotdiffuse.core.types import NO_SPHERES, Mask, Points, Poses, Spheres
 from robotdiffuse.robots.bodies import Surface
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, convex_parts
 from robotdiffuse.robots.fitting.self_collisions import (
@@ -233,7 +233,7 @@ class _Link:
     parts: PartSettings
     tight: Points = field(default_factory=lambda: np.zeros((0, 3)))
     """Places in the link's frame where parts should stick out less [m]."""
-    narrow: Spheres = field(default_factory=lambda: np.zeros((0, 4)))
+    narrow: Spheres = field(default_factory=lambda: NO_SPHERES)
     """Places in the link's frame where spheres should stick out less (see `Bounds.tight`)."""
 
     def decompose(self, robot: Robot) -> Robot:

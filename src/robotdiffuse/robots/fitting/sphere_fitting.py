@@ -25,7 +25,7 @@ from numpy import ndarray
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from robotdiffuse.core.types import Mask, Points, Spheres, Values, Vector, for_kernels
+from robotdiffuse.core.types import NO_SPHERES, Mask, Points, Spheres, Values, Vector, for_kernels
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_parts import planes_of
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import (
@@ -69,7 +69,7 @@ class Bounds(NamedTuple):
     """How far a sphere may stick out of the link [m]."""
     hidden: Callable[[Points], Mask] | None = None
     """Tells which points are inside a neighboring link: spheres may contain such points."""
-    tight: Spheres = np.zeros((0, 4))
+    tight: Spheres = NO_SPHERES
     """Tight places: rows of x, y, z and how far spheres may stick out there [m]. Near these places, `hidden`
     does not apply."""
     floor: tuple[Vector, float] | None = None
@@ -306,10 +306,12 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Spheres) -> bool:
     (True), a corner is outside all spheres, or a triangle is smaller than SMALLEST_TRIANGLE (False).
     Triangles and corners inside another mesh are ignored, since they are not on the surface.
     """
+    from trimesh.remesh import subdivide  # slow to import, and only preparation needs it
+
     triangles = np.concatenate([mesh.triangles for mesh in meshes])
     spheres = for_kernels(spheres)
     mesh_planes = [stacked_planes((mesh,)) for mesh in meshes] if len(meshes) > 1 else []
-    while len(triangles):
+    while True:
         corners = triangles.reshape(-1, 3)
         contained, outside = held_by_one(triangles, spheres)
         is_open = ~contained
@@ -319,16 +321,12 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Spheres) -> bool:
             outside &= ~hidden
         if outside.any():
             return False
-        triangles = triangles[is_open]
-        if len(triangles) and np.linalg.norm(np.ptp(triangles, axis=1), axis=1).min() < SMALLEST_TRIANGLE:
+        if not is_open.any():
+            return True
+        if np.linalg.norm(np.ptp(triangles[is_open], axis=1), axis=1).min() < SMALLEST_TRIANGLE:
             return False
-        a, b, c = np.moveaxis(triangles, 1, 0)
-        ab = (a + b) / 2
-        bc = (b + c) / 2
-        ca = (c + a) / 2
-        quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-        triangles = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters])
-    return True
+        vertices, faces, *_ = subdivide(corners, np.arange(len(corners)).reshape(-1, 3)[is_open])
+        triangles = vertices[faces]
 
 
 class Cells(NamedTuple):

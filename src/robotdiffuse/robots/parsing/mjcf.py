@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import MAX_WORD, InputError, needs, shortened, shown
@@ -26,7 +25,7 @@ from robotdiffuse.core.transforms import (
     transform,
     xyzw_of,
 )
-from robotdiffuse.core.types import Mask, Pose, Values, Vector
+from robotdiffuse.core.types import Mask, Pose, Quaternion, Values, Vector
 from robotdiffuse.robots.fitting.convex_parts import convex_hull
 from robotdiffuse.robots.parsing.srdf import Srdf
 
@@ -416,7 +415,7 @@ def _related(model: Any, first: int, second: int, unfiltered: bool) -> bool:
     return bool(welded[0] == welded[1] or (carried and WORLD not in welded and not unfiltered))
 
 
-def _pose(xyz: Vector, wxyz: Float[ndarray, "4"]) -> Pose:
+def _pose(xyz: Vector, wxyz: Quaternion) -> Pose:
     return transform(xyz, rotation_from_quaternion(wxyz))
 
 

@@ -78,8 +78,7 @@ class Srdf:
     def _named(self, group: str, above: dict[str, Joint], within: tuple[str, ...]) -> set[str]:
         if group in within:
             raise InputError(f"{self.path}: group {group} contains itself")
-        if group not in self.groups:
-            raise unknown_name(f"group in {self.path}", group, self.groups)
+        check_name(f"group in {self.path}", group, self.groups)
         content = self.groups[group]
         joint_names = {joint.name for joint in above.values()}
         for name in content.joints:
@@ -321,8 +320,8 @@ def planned_joints(
     neither `tip` nor `group` is given.
     """
     above = {joint.child: joint for joint in joints}
-    if tip is not None and tip not in (base, *above):
-        raise unknown_name(f"tip link below {base} in {file.name}", tip, [base, *above])
+    if tip is not None:
+        check_name(f"tip link below {base} in {file.name}", tip, [base, *above])
     chosen: list[str] | None = None
     tips = [tip] if tip else []
     if group in srdf.groups:

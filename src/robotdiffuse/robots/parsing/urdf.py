@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -21,6 +22,7 @@ from robotdiffuse.core.errors import (
     MIN_SIZE,
     InputError,
     check_name,
+    check_type,
     joined,
     located,
     points,
@@ -722,9 +724,8 @@ def with_limits(robot: Robot, limits: Mapping[str, dict[str, float]]) -> Robot:
     return replace(robot, joints=tuple(_changed(joint, limits.get(joint.name, {})) for joint in robot.joints))
 
 
-def _fields(file: str, joint: str, entry: object) -> dict[str, float]:
-    if not isinstance(entry, dict):
-        raise InputError(f"{file}: joint_limits of {joint} is {shown(entry)}; it must be a mapping")
+def _fields(file: str, joint: str, entry: Any) -> dict[str, float]:
+    check_type(f"{file}: joint_limits of {joint}", entry, dict, "a mapping")
     fields = dict[str, float]()
     for key, value in entry.items():
         # flags of MoveIt, such as has_jerk_limits
