@@ -117,7 +117,9 @@ def result_file(folder: FilePath, scene: rd.Scene) -> str:
 def test_a_world_that_fails_to_load_leaves_no_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
     clients: list[int] = []
     connect = world.pybullet.connect
-    monkeypatch.setattr(world.pybullet, "connect", lambda mode: clients.append(connect(mode)) or clients[0])
+    monkeypatch.setattr(
+        world.pybullet, "connect", lambda mode, **options: clients.append(connect(mode, **options)) or clients[0]
+    )
     monkeypatch.setattr(world, "write_urdf", Mock(side_effect=OSError("no space left")))
     refuses("cannot be written: no space left", world.World, box_arm(), rd.Scene())
     assert not world.pybullet.isConnected(clients[0])

@@ -486,7 +486,7 @@ def _robot(urdf: str | Path, tip: str, srdf: str | Path | None, package: str) ->
     user's robots."""
     if str(urdf) in ROBOTS:
         return load_robot(str(urdf))
-    packages = dict[str, str | Path]()
+    packages: dict[str, str | Path] = {}
     if package:
         if not Path(package).is_dir():
             raise InputError(f"package_keyword_replacement is {shown(package)}; it must be a folder")

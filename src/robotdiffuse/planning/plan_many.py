@@ -138,7 +138,7 @@ def _planned(
 ) -> Results:
     robots, tasks = _tasks(problems)
     with Workers(workers, _prepare, (arguments, robots, request)) as pool:
-        calls = {pool.submit(_plan, *task): i for i, task in enumerate(tasks)}
+        calls: dict[Any, int] = {pool.submit(_plan, *task): i for i, task in enumerate(tasks)}
         for call in as_completed(calls):
             error = call.exception()
             if error is None:

@@ -388,7 +388,7 @@ class Verifier:
             self._twitch(q, clock),
             self._constrained(q, clock, along),
         )
-        found = [*filter(None, every)]
+        found = [violation for violation in every if violation is not None]
         first = min(found, key=attrgetter("time"), default=None)
         last = len(q) - 1 if first is None else int(np.searchsorted(clock, first.time))
         sweep = self._continuous.sweep(q[: last + 1])
@@ -402,7 +402,7 @@ class Verifier:
             if moving.contact is not None:
                 candidates.append(_moving_contact_violation(moving.contact))
         candidates += [self._waypoints(q, clock, at_rest), self._goal(q[-1], float(clock[-1]))]
-        earliest = [*filter(None, candidates)]
+        earliest = [v for v in candidates if v is not None]
         violation = min(earliest, key=attrgetter("time"), default=None)
         every_violation = tuple(dict.fromkeys((*found, *earliest)))
         clearances = (scene, sweep.self_clearance) if violation is None else (None, None)
