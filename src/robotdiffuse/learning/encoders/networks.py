@@ -133,10 +133,14 @@ def pool_max(features: Features, near: Near) -> Pooled:
     return best.masked_fill(~near.any(1, keepdim=True), 0.0)
 
 
+def pool_mean(features: Features, near: Near) -> Pooled:
+    """Mean feature over the points that count; zeros for clouds without any."""
+    return (features.float() * near[..., None]).sum(1) / near.sum(1, keepdim=True).clamp(min=1)
+
+
 def pool_both(features: Features, near: Near) -> Float[Tensor, "batch 2*channels"]:
-    """Maximum and mean feature over the points that count; zeros for clouds without any."""
-    mean = (features.float() * near[..., None]).sum(1) / near.sum(1, keepdim=True).clamp(min=1)
-    return torch.cat([pool_max(features, near).float(), mean], -1)
+    """Maximum and mean feature over the points that count."""
+    return torch.cat([pool_max(features, near).float(), pool_mean(features, near)], -1)
 
 
 class CompressionAutoencoder(Autoencoder):
