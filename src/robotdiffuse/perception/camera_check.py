@@ -28,7 +28,7 @@ MAX_INTRINSICS = 100.0
 MAX_THROUGH = 0.9
 """An image that sees through a larger fraction of the arm cannot be that of the stated camera."""
 MIN_CELLS = 40
-"""With fewer cells that show the arm, the camera cannot be checked."""
+"""A view in which fewer cells show the arm neither confirms nor contradicts its camera."""
 MIN_AGREEMENT = 0.6
 """If at least this fraction of the arm's cells has the arm's depth, the camera is correct to centimeters."""
 MIN_NAMED = 0.4
@@ -37,11 +37,11 @@ depth. The fraction is below MIN_AGREEMENT, since objects in front of the arm ma
 BETTER = 1.5
 """A mistake is named only if undoing it raises the agreement by at least this factor."""
 STANDS_OUT = 0.2
-"""A mistake is named only if undoing it stands out: the fraction of the arm's cells with the arm's depth must
-fall by this much if the arm's image is then moved by any of SHIFTS. It falls less if these depths are from a
-table, which has similar depths all around."""
+"""A mistake is named only if undoing it fits the arm at one place only: each of SHIFTS, applied to the image
+rendered of the arm, must lower the fraction of the arm's cells with the arm's depth by more than this. It
+falls less if these depths are from a table, which has similar depths all around."""
 SHIFTS = ((0, 12), (0, -12), (12, 0), (-12, 0))
-"""Movements of the arm's image, down and to the right [cells]."""
+"""Movements of the image rendered of the arm, down and to the right [cells]."""
 MIN_THROUGH = 0.35
 """An image that sees through at least this fraction of the arm gets a note even if no mistake explains it."""
 OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -118,7 +118,7 @@ def mistakes(view: DepthView) -> Iterator[tuple[str, DepthView]]:
         "T_base_camera is turned into the optical frame twice": T @ OPTICAL.T,
         "T_base_camera has y up and z back, as OpenGL; the optical frame has y down and z ahead": T @ flipped,
         "T_base_camera is the inverse of the pose of the camera's body": inverse @ OPTICAL,
-        "T_base_camera is an inverse, turned into the optical frame": np.linalg.inv(T @ OPTICAL.T),
+        "T_base_camera is T_camera_base, turned into the optical frame": np.linalg.inv(T @ OPTICAL.T),
     }
     for name, quaternion in (
         ("transposed rotation", wxyz * (1, -1, -1, -1)),
@@ -138,8 +138,8 @@ def mistakes(view: DepthView) -> Iterator[tuple[str, DepthView]]:
 
 
 def camera_note(view: DepthView, robot: Robot, start: Configuration) -> str:
-    """What is wrong with a view's camera, as the arm in the image shows; "" if nothing is wrong, or if too
-    little of the arm is visible. The last 32 results are cached, as several calls may use the same view.
+    """What is wrong with a view's camera, as the arm in the image shows; "" if nothing wrong is found. The
+    last 32 results are cached, as several calls may use the same view.
 
     start: the arm's configuration if the view states none.
     """

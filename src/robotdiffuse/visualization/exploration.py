@@ -175,7 +175,7 @@ def faces_between(inside: Voxels, outside: Voxels) -> tuple[Int[ndarray, "n"], M
 
 def faces_surface(inside: Voxels, outside: Voxels, color: Color) -> Surface:
     """The faces between two sets of voxels of the map, as a surface in the base frame. Normals point out of
-    the set `inside`, and corners are counterclockwise when seen against the normal."""
+    the set `inside`, and corners are counterclockwise when seen from outside it."""
     numbers, first = faces_between(inside, outside)
     axis, flat = np.divmod(numbers, inside.size)
     at = np.stack(np.unravel_index(flat, inside.shape), axis=1)

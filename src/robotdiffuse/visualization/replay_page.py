@@ -85,7 +85,7 @@ MAX_ROWS = 3000
 VIEW_SIZE = (1600, 1000)
 """Window size for which the first view is chosen [pixels]."""
 VIEW_MARGINS = (0.09, 0.15)
-"""Fractions of the window's height left free for the panels above and below by the first view."""
+"""The first view leaves these fractions of the window's height free for the panels above and below."""
 
 
 def write_replay(

@@ -232,7 +232,8 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
                     inflation = tracks.growth[o] * max(time, 0.0)
                     clearance_loss = travel[link] + obstacle_travel + tracks.growth[o] * half_duration
                     required = max(least, tightness * best[0])
-                    # above cutoff, a lower bound is enough: it settles the pair and keeps best[0]
+                    # above cutoff, a lower bound is enough: it settles the pair without changing best[0],
+                    # unless tightness is 0
                     cutoff = inflation + clearance_loss + max(required, best[0] if tightness > 0 else 0.0)
                     clearance = (
                         _clearance(links, frames, link, tracks, o, rotation, box_center, cutoff) - inflation
