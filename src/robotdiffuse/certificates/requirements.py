@@ -4,11 +4,11 @@ start, goal, rates, path constraints and torques. They are independent of the va
 Path constraints: from one configuration to the next, each joint j moves by dq_j at a constant rate. The
 origin p of a frame then deviates from the chord (the straight line between its two positions) by at most an
 eighth of its largest second derivative. This derivative is at most sum_jk |dq_j dq_k| L_m with m = max(j, k),
-where L_m is an upper bound on the distance of p from the axis of joint m during the motion. The distance of a
-point to a convex body is a convex function. So along the chord, this distance is at most the larger of its
-values at the two ends; the deviation is added. An axis of the frame deviates from its own chord by at most
-(sum_j |dq_j|)² / 8. On a Cartesian line, the angle between the frame and its interpolated orientation
-changes no faster than the sum of their speeds of rotation.
+where L_m is an upper bound on the distance of p from the axis of joint m during the motion. A constraint
+keeps p in a convex set. The distance to such a set is a convex function. So along the chord, this distance is
+at most the larger of its values at the two ends; the deviation is added. An axis of the frame deviates from
+its own chord by at most (sum_j |dq_j|)² / 8. On a Cartesian line, the angle between the frame and its
+interpolated orientation changes no faster than the sum of their speeds of rotation.
 
 Torques are computed at samples: the rows of the motion and places between them. Between two samples,
 positions follow a cubic or a straight line, and velocities and accelerations are its derivatives.

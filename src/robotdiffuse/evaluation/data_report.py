@@ -216,7 +216,7 @@ def write_page(folder: str | Path, file: str | Path, robot: Robot | None = None)
     matplotlib is not installed, for a file that cannot be written, for another robot than that of the data,
     and as `read_figures` does.
     """
-    read_manifest(folder)  # first, since without a data set the page's folder is often missing too
+    read_manifest(folder)  # first: the error should name the missing data set, not the page's folder
     target = check_output(file, (".html", ".htm"))
     data = read_figures(folder)
     data.manifest.check_robot(robot)

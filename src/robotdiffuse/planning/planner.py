@@ -234,7 +234,7 @@ class CheckedSettings(Settings):
     validator certifies the motion in between. After a path that the validator refuses, the search starts
     again with half this distance."""
     clearance: NotNegative = 0.002
-    """Distance to obstacles that paths keep where start and goal allow it [m], as for `rrt_connect`."""
+    """Distance to obstacles that paths keep where start and goal allow it [m]."""
 
 
 def ever_finer(context: PlanningContext, settings: PlannerSettings) -> Iterator[PlannerSettings]:

@@ -5,13 +5,13 @@ an image. Motions follow one of two policies, or the first and then the second.
 
 **Strict.** The arm enters only voxels that were seen free: the validator accepts each motion among obstacles
 that cover all other space (`viewpoints.py`). Besides `free_zone`, there are two exceptions: voxels with
-centers within 3 cm of the arm at the start of the motion, and, for motions to the goal or on the way back,
-the space within 2 cm of the arm at their end. Seen points are obstacles even there. With `see_goal`, the
-arm's surface at the goal must also have been seen free (`viewpoints.GoalSeen`). The promise is as good as the
-map: if the scene does not change, and the camera's poses and errors are as stated, such a motion does not
-collide. Seen points may be displaced by the error of their camera's pose, and an obstacle may be anywhere
-within this error of a seen point. This space counts as free only if some view shows it free for every camera
-pose within the error of that view's pose. Views from nearby can show this.
+centers within 3 cm of the arm at the start of the motion, and, for motions to the goal or back along the
+latest motion, the space within 2 cm of the arm at their end. Seen points are obstacles even there. With
+`see_goal`, the arm's surface at the goal must also have been seen free (`viewpoints.GoalSeen`). The promise
+is as good as the map: if the scene does not change, and the camera's poses and errors are as stated, such a
+motion does not collide. Seen points may be displaced by the error of their camera's pose, and an obstacle may
+be anywhere within this error of a seen point. This space counts as free only if some view shows it free for
+every camera pose within the error of that view's pose. Views from nearby can show this.
 
 **Probabilistic.** The arm executes a motion whose stated `confidence` is high enough, and otherwise looks
 first. The confidence follows from the predicted occupancy probabilities of the unknown voxels that the motion
@@ -262,7 +262,7 @@ class Explorer:
         self._news = list[DepthView]()
         """Views since the latest step."""
         self._fixed_view: DepthView | None = None
-        """The last view of a camera that is not on the arm, between the last two calls of `next`."""
+        """The latest view of a camera that is not on the arm, if one came since the last call of `next`."""
         self._free = self.map.free
         """Voxels that were free at the latest step."""
 
@@ -467,13 +467,13 @@ class Explorer:
         predicted: Probabilities | None,
         motion: PlanResult,
     ) -> Step:
-        """The step if `_go` refused what the search for a motion under the policy returned.
+        """The step if `_go` refused the result of the search for a motion under the policy.
 
         GO if a tentative motion keeps to the policy. If not, LOOK: at the unseen space that this motion
         sweeps, or from farther back on the way in. STUCK, with the reason, if no such view can be taken.
 
-        motion: what the search returned: a failed result, or a motion to the goal that does not keep to the
-        policy or whose goal must be seen first.
+        motion: this result: a failed one, or a motion to the goal that does not keep to the policy or whose
+        goal must be seen first.
         """
         why = self._goal_seen.missing(motion) or motion.reason
         if motion.solved and policy == PROBABILISTIC:

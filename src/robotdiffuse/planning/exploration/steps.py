@@ -79,8 +79,8 @@ class ExplorerSettings(Settings, name="explorer"):
     max_views: Natural = 8
     """Maximum number of steps of the kind look on the way to a goal."""
     look_attempts: Count = 4
-    """A step tries to plan motions to at most this many viewpoints times the number of cameras, the best
-    first."""
+    """A step tries to plan motions to the best viewpoints: to at most this number times the number of
+    cameras."""
     predict: bool = True
     """Whether the occupancy completion network weighs viewpoints and gives confidences, if it covers the
     arm's reach."""

@@ -519,9 +519,8 @@ def measure_false_collisions(
         false_spheres = np.flatnonzero(spheres & ~parts & free)[:MAX_SPHERE_CASES]
         all_gaps = np.array([links.mesh_distance(poses, a, b, int(i)) for i in false_spheres])
         # leave out the cases with the narrowest gaps, see NARROWEST_FRACTION
-        far_enough = all_gaps >= np.sort(all_gaps)[
-            : int(samples * NARROWEST_FRACTION * len(false_spheres) / max(spheres.sum(), 1)) + 1
-        ].max(initial=0.0)
+        narrow = int(samples * NARROWEST_FRACTION * len(false_spheres) / max(spheres.sum(), 1))
+        far_enough = all_gaps >= np.sort(all_gaps)[: narrow + 1].max(initial=0.0)
         false_spheres = false_spheres[far_enough]
         gaps = all_gaps[far_enough]
         T_base_a = poses[a][false_spheres]
