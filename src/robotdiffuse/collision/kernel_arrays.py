@@ -335,7 +335,7 @@ def _grid_around(
     clouds = [NO_SPHERES]
     for i, shape in enumerate(shapes):
         points = sum(map(len, clouds))
-        check_time(f"{len(shapes) - i} of {len(shapes)} meshes and clouds; the others gave {points:,} points")
+        check_time(f"{len(shapes) - i} of {len(shapes)} meshes and clouds ({points:,} points are ready)")
         clouds.append(_cover(shape, reach))
     cloud = np.concatenate(clouds)
     check_time(f"the grid of {len(cloud):,} points", GRID_SECONDS_PER_POINT * len(cloud))

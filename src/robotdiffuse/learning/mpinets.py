@@ -14,11 +14,11 @@ for the configuration and 512, 256, 128 for the decoder.
 Differences from the paper:
 
 - *Size*, for training on one core (the paper's numbers in brackets): a cloud of 256 points of the scene, and
-  for each link 12 points of the robot and 6 of the target, 120 and 60 for a Panda (4,096, 2,048 and 128);
-  two set abstractions with 96 and 24 centers (512 and 128), 16 neighbors (128), and balls of 0.2 and 0.6 m
-  (0.05 and 0.3 m), since the cloud is sparser; narrower layers (1,024 features in the last one
-  of PointNet++, and 4,096, 2,048 and 2,048 after it); batches of 128 at a learning rate of 2e-3 (10 at 1e-4);
-  losses on the robot's points of the cloud (1,024 points).
+  for each link 12 points of the robot and 6 of the target, 120 and 60 for a Panda (4,096, 2,048 and 128); two
+  set abstractions with 96 and 24 centers (512 and 128), 16 neighbors (128), and balls of 0.2 and 0.6 m (0.05
+  and 0.3 m), since the cloud is sparser; narrower layers (1,024 features in the last one of PointNet++, and
+  4,096, 2,048 and 2,048 after it); batches of 128 at a learning rate of 2e-3 (10 at 1e-4); losses on the
+  robot's points of the cloud (1,024 points).
 - *Target*: a configuration, to be reached within 1e-4 rad; the paper's target is a pose of the hand. So the
   target's points are those of the whole arm at the goal, the direction to the goal configuration is a further
   input of the configuration encoder, and points are labeled by link, not only as scene, robot or target.

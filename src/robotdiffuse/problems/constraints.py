@@ -162,9 +162,9 @@ class CartesianLine(FrameConstraint):
     """The origin of a link moves on the straight segment from its start position to its goal position.
 
     The goal must therefore determine the pose of the link. It may be a configuration, several configurations
-    with the link at the same pose, or poses of links. Of these, at least one pose of this link, or
-    of a link rigidly connected to it, must be without tolerances. The orientation follows the shortest
-    rotation from start to goal, in proportion to the fraction of the segment traveled.
+    with the link at the same pose, or poses of links. Of these, at least one pose of this link, or of a link
+    rigidly connected to it, must be without tolerances. The orientation follows the shortest rotation from
+    start to goal, in proportion to the fraction of the segment traveled.
     """
 
     kind: ClassVar[str] = "cartesian_line"

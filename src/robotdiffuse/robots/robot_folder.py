@@ -76,11 +76,11 @@ def write_robot_folder(robot: Robot, folder: Path, source: JsonObject) -> None:
     """Write meshes.npz, for grazing links surfaces.npz, and robot.json into a folder. Each file is written
     atomically; other files in the folder stay.
 
-    `source` describes the robot's origin by the keys urdf, sha256 and license. If the SRDF that belongs to
-    the URDF was read, and no other, it also has srdf, the digest of this SRDF. If preparation measured them,
-    it also has `free`, the fraction of configurations that are free, and `refused`, the fraction of the free
-    configurations in which covering spheres collide falsely. Raises InputError if the folder cannot be
-    written.
+    `source` describes the robot's origin by the keys urdf, sha256 and license. Unless another SRDF than the
+    one that belongs to the URDF was given, it also has srdf, the digest of that SRDF ("" if there is none).
+    If preparation measured them, it also has `free`, the fraction of configurations that are free, and
+    `refused`, the fraction of the free configurations in which covering spheres collide falsely. Raises
+    InputError if the folder cannot be written.
     """
     arrays = _packed([(link, mesh) for link, meshes in robot.meshes.items() for mesh in meshes])
     files = {MESH_FILE: _npz(arrays)}

@@ -67,8 +67,8 @@ class World:
     """A robot on a fixed base, and replaceable obstacles. Call `close`, or use it in a `with` statement.
 
     Collisions are enabled for exactly the pairs that RobotDiffuse checks: a link that a planned joint moves
-    and an obstacle that the link may not touch, or two links that may not touch, with a planned
-    joint between them.
+    and an obstacle that the link may not touch, or two links that may not touch, with a planned joint between
+    them.
     """
 
     def __init__(self, robot: Robot, scene: Scene, moving: Sequence[MovingObstacle] = ()) -> None:

@@ -301,11 +301,11 @@ def clearances_and_gradients_into(robot, scene, q, limit, margin, work, clearanc
     clearances_into(robot, scene, q, limit, work, clearances)
     scratch = make_cost_workspace(q.shape[1])
     pairs = np.zeros(len(robot.pairs), np.float32)  # no cost at a self margin of 0
-    gradients[:] = np.float32(0.0)
+    gradients[:] = ZERO
     for i in range(len(q)):
         if clearances[i].min() < margin:
-            cost = cost_gradient_at(robot, scene, q[i], pairs, margin, np.float32(0.0), scratch, gradients[i])
-            if cost > np.float32(0.0):
+            cost = cost_gradient_at(robot, scene, q[i], pairs, margin, ZERO, scratch, gradients[i])
+            if cost > ZERO:
                 gradients[i] /= np.sqrt(np.float32(2.0) * cost)
 
 

@@ -58,7 +58,7 @@ def make_scratch(space, q):
 @allocation_free(fastmath=True)
 def distance(a, b):
     """Distance of two configurations in joint space [rad, L2]."""
-    total = np.float32(0.0)
+    total = ZERO
     for j in range(len(a)):
         d = np.float32(a[j] - b[j])
         total += d * d
@@ -68,7 +68,7 @@ def distance(a, b):
 @kernel()
 def path_length(path):
     """Sum of the lengths of the segments [rad]."""
-    total = np.float32(0.0)
+    total = ZERO
     for i in range(len(path) - 1):
         total += distance(path[i], path[i + 1])
     return total
@@ -83,7 +83,7 @@ def motion_free(space, a, b, scratch):
     Microseconds", ICRA 2024).
     """
     if len(space.near_ends) == 0:
-        return _stretch_free(space, a, b, np.float32(0.0), ONE, space.padding, scratch)
+        return _stretch_free(space, a, b, ZERO, ONE, space.padding, scratch)
     length = distance(a, b)
     steps = max(int(np.ceil(length / RELAXATION_STEP)), 1)
     half = np.float32(0.5) * length / np.float32(steps)
@@ -113,7 +113,7 @@ def padding_near(space, a, b, share, around):
     padding = space.padding
     dof = len(a)
     for m in range(len(space.near_ends)):
-        total = np.float32(0.0)
+        total = ZERO
         for j in range(dof):
             d = np.float32(a[j] + share * (b[j] - a[j]) - space.near_ends[m, j])
             total += d * d
@@ -127,7 +127,7 @@ def padding_near(space, a, b, share, around):
 def _stretch_free(space, a, b, s, t, padding, scratch):
     """Whether the motion from a + s (b - a), exclusive, to a + t (b - a), inclusive, is free of collision."""
     dof = len(a)
-    travel = np.float32(0.0)
+    travel = ZERO
     for j in range(dof):
         travel += (t - s) * np.float32(abs(b[j] - a[j])) * space.motion_radii[j]
     blocks = max(int(np.ceil(travel / space.resolution / np.float32(W))), 1)

@@ -28,6 +28,7 @@ from robotdiffuse.collision.motions import search_space, with_covering_spheres
 from robotdiffuse.core.errors import InputError, check_type, rigid_transform
 from robotdiffuse.core.transforms import placed
 from robotdiffuse.core.types import (
+    NO_SPHERES,
     Configuration,
     Configurations,
     Path,
@@ -91,7 +92,7 @@ def not_seen_free(
     space are split, and small balls cover only their parts outside. Seen points are separate obstacles.
     """
     unseen = ~(known.free | near_ends(known, (start,)))
-    spheres = np.zeros((0, 4))
+    spheres = NO_SPHERES
     if goals:
         spheres = np.concatenate([known.robot.placed_spheres(q) for q in goals])
     near = MAP.within(spheres, CARVING_MARGIN + COVER_RADIUS)

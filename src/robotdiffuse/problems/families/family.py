@@ -11,6 +11,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Natural, Positive, Settings
 from robotdiffuse.core.types import (
+    NO_SPHERES,
     Configuration,
     Configurations,
     JointRows,
@@ -223,7 +224,7 @@ def between_targets(
 def base_spheres(robot: Robot) -> Spheres:
     """Collision spheres (x, y, z, radius) of the links that no planned joint moves, in the base frame [m]."""
     fixed = [link for link in robot.spheres if robot.link_frame(link) == 0]
-    return np.concatenate([np.zeros((0, 4)), *map(robot.frame_spheres, fixed)])
+    return np.concatenate([NO_SPHERES, *map(robot.frame_spheres, fixed)])
 
 
 def is_clear_of(shape: Sphere | Box, keep_out: Spheres | None) -> bool:
