@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import Event, Thread
 from typing import TYPE_CHECKING
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP
 from robotdiffuse.core.loading import compiled
 from robotdiffuse.core.tables import Table, show
+from robotdiffuse.core.types import Done
 
 if TYPE_CHECKING:
     from robotdiffuse.certificates.certificate import Certificate
@@ -84,7 +85,7 @@ def say(text: str) -> None:
 
 
 @contextmanager
-def progress(what: str) -> Iterator[Callable[[int, int], None]]:
+def progress(what: str) -> Iterator[Done]:
     """Yields a function `update(done, total)` that moves a progress bar on standard error. If standard error
     is not a terminal, the function prints a line at its first call and then every COUNT_INTERVAL."""
     from rich.console import Console

@@ -198,7 +198,7 @@ def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
 def compile_tracks(moving: Sequence[MovingObstacle]) -> Tracks:
     """The arrays of moving obstacles for compiled code. A mesh is represented by its bounding box."""
     # times, positions, quaternions and speeds: an empty entry, in case there is none, then one per obstacle
-    tracks = [(np.zeros(0), np.zeros((0, 3)), NO_SPHERES, np.zeros(0))]
+    tracks = [(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0))]
     solids = list[Solid]()
     for obstacle in moving:
         at, poses = obstacle.track

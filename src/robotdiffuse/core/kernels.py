@@ -40,6 +40,7 @@ errors.ColorShell = nullcontext  # type: ignore[misc]
 ZERO = np.float32(0.0)
 HALF = np.float32(0.5)
 ONE = np.float32(1.0)
+TINY = np.float32(1e-9)  # against division by zero
 # Marks the checksum at the end of a file of compiled code; Numba ignores what follows its own data.
 CHECKSUM = b"crc32"
 PACKAGE = Path(__file__).parents[1]

@@ -172,7 +172,8 @@ def box_around(points: Points) -> Float[ndarray, "2 3"]:
 
 def ball_around(points: Points) -> tuple[Vector, float]:
     """Center and radius [m] of a ball around the points; its center is the center of their bounding box."""
-    center = (points.min(axis=0) + points.max(axis=0)) / 2
+    low, high = box_around(points)
+    center = (low + high) / 2
     return center, float(np.linalg.norm(points - center, axis=1).max())
 
 

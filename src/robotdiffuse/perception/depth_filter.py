@@ -133,8 +133,8 @@ def filtered(view: DepthView) -> FilteredDepth:
     """The view's image; if it is noisy, filtered by `median_filter` and `smoothed`.
 
     Images made from clouds count as free of noise, since their pixels are not those of a sensor; so do images
-    without a stated noise that are too small for `patch_noise`. The last 32 results are cached,
-    because planning with views uses each image several times.
+    without a stated noise that are too small for `patch_noise`. The last 32 results are cached, because
+    planning with views uses each image several times.
     """
     depth = np.maximum(for_kernels(view.depth, np.float32), np.float32(0.0))
     if view.cloud is not None:

@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.kernels import HALF, ONE, ZERO, kernel
+from robotdiffuse.core.kernels import HALF, ONE, TINY, ZERO, kernel
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.core.types import Configuration, Pose, Spheres, Vector
 from robotdiffuse.perception.depth_view import DepthView, Intrinsics
@@ -76,7 +76,7 @@ def _sphere(ox, oy, oz, dx, dy, dz, r):
 @kernel(fastmath=FASTMATH)
 def _slab(o, d, half):
     """The parameters at which a ray enters and leaves |x| < half."""
-    if abs(d) < np.float32(1e-9):
+    if abs(d) < TINY:
         return (-_MISS, _MISS) if abs(o) < half else (_MISS, -_MISS)
     a = (-half - o) / d
     b = (half - o) / d

@@ -122,8 +122,8 @@ MAP = VoxelGrid(
     (FINE_SHAPE[0], FINE_SHAPE[1], FINE_SHAPE[2] + LAYERS_BELOW),
     FINE_VOXEL_SIZE,
 )
-"""The voxels of an `OccupancyMap`: the fine ones of the observed volume, and further ones down to
-0.4 m below it, where an arm on a stand reaches."""
+"""The voxels of an `OccupancyMap`: the fine ones of the observed volume, and further ones down to 0.4 m
+below it, where an arm on a stand reaches."""
 
 
 def refined(voxels: Bool[ndarray, "mx my mz"], parts: int = 2) -> Voxels:

@@ -105,8 +105,8 @@ def _residuals(rows, limits, q, work):
                     for i in range(3):
                         entry += ANGLE_WEIGHT * work.axes[k, i] * work.error[i] / sine
                 else:
-                    # the axis of the CONE is opposite to its direction: a turn about any
-                    # other axis reduces the angle; (1, 1, 1) is taken
+                    # the axis of the CONE is opposite to its direction: a turn about any other axis
+                    # reduces the angle; (1, 1, 1) is taken
                     entry = ANGLE_WEIGHT * np.sum(work.axes[k])
                 work.J[count, rows.chain[m, k]] = entry
             count += 1

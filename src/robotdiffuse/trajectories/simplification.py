@@ -8,7 +8,7 @@ import numpy as np
 
 from robotdiffuse.collision.kernels.motions import distance, make_scratch, motion_free, path_length
 from robotdiffuse.collision.kernels.random import random
-from robotdiffuse.core.kernels import HALF, ONE, inner_kernel, kernel
+from robotdiffuse.core.kernels import HALF, ONE, TINY, inner_kernel, kernel
 
 MAX_SUBDIVISIONS = 5
 """Largest number of subdivisions in a round of corner smoothing."""
@@ -149,7 +149,7 @@ def _move(space, points, i, anywhere, scratch, state):
     after = points[i + 1]
     d1 = distance(before, at)
     d2 = distance(at, after)
-    share = d1 / max(d1 + d2, np.float32(1e-9))
+    share = d1 / max(d1 + d2, TINY)
     pull = random(state) ** 2
     far = MAX_RANDOM_MOVE * np.exp(-RANDOM_MOVE_LOG_RANGE * random(state)) if anywhere else np.float32(0.0)
     for j in range(points.shape[1]):

@@ -66,9 +66,9 @@ def _lit(light, at, n, first):
     """Fraction of directional lights that reach a point `at` with normal n, weighted by the cosine of their
     angles. Only every fourth light from `first` on is used.
 
-    Each light has an orthographic map. For the surface that is nearest to the light, a texel holds
-    the coordinate along the direction to the light, plus 100 m so that it is positive. The point is moved
-    along its normal, so that surfaces do not shadow themselves.
+    Each light has an orthographic map. For the surface that is nearest to the light, a texel holds the
+    coordinate along the direction to the light, plus 100 m so that it is positive. The point is moved along
+    its normal, so that surfaces do not shadow themselves.
     """
     maps, directions, scale, center = light
     bias = 2 / scale

@@ -19,7 +19,7 @@ from PIL import Image
 
 from robotdiffuse.core.errors import InputError, check_type, counted, shortened
 from robotdiffuse.core.files import JsonObject, check_output, write_atomically
-from robotdiffuse.core.transforms import IDENTITY, inverse, moved_spheres, quaternion_from_rotation
+from robotdiffuse.core.transforms import IDENTITY, inverse, quaternion_from_rotation
 from robotdiffuse.core.types import (
     Configuration,
     Configurations,
@@ -210,9 +210,9 @@ def _track(obstacle: Drawable, motion: Path | Trajectory) -> list[list[float]]:
 def _spheres(robot: Robot) -> list[list[float | int]]:
     """For each covering sphere: the index of its frame, and x, y, z and radius in this frame [m]."""
     rows = []
-    for link, spheres in robot.spheres.items():
-        placed = moved_spheres(robot.T_frame_link(link), spheres)
-        rows += [[robot.link_frame(link), *sphere] for sphere in _rounded(placed, 4)]
+    for link in robot.spheres:
+        spheres = _rounded(robot.frame_spheres(link), 4)
+        rows += [[robot.link_frame(link), *sphere] for sphere in spheres]
     return rows
 
 

@@ -22,12 +22,11 @@ from robotdiffuse.collision.kernels.lane_clearance import (
 from robotdiffuse.collision.kernels.lane_collision import in_axes, near_boxes, placed
 from robotdiffuse.collision.kernels.point_grid import near_point, points_lower_bound
 from robotdiffuse.collision.kernels.simd import W, first_lane, lane, load, load_vector, minimum, vector_in
-from robotdiffuse.core.kernels import HALF, ONE, ZERO, allocation_free, inner_kernel, kernel
+from robotdiffuse.core.kernels import HALF, ONE, TINY, ZERO, allocation_free, inner_kernel, kernel
 from robotdiffuse.robots.frame_kernel import cross, dot, length, minus, plus, times, write
 
 CLEARANCE_CAP = np.float32(1.0)
 """Larger clearances are capped at this value [m]."""
-_TINY = np.float32(1e-9)
 
 
 @allocation_free(fastmath=True)
@@ -70,7 +69,7 @@ def solid_distance(solid, p):
     pu = ZERO
     pv = np.copysign(ONE, v)
     if solid[16] > ZERO:
-        r = np.sqrt(u * u + v * v) + _TINY
+        r = np.sqrt(u * u + v * v) + TINY
         a = r - solid[12]
         b = -solid[12]
         ou = u / r
@@ -90,7 +89,7 @@ def solid_distance(solid, p):
         a = max(a, ZERO)
         b = max(b, ZERO)
         c = max(c, ZERO)
-        d = np.sqrt(a * a + b * b + c * c) + _TINY
+        d = np.sqrt(a * a + b * b + c * c) + TINY
         na = a / d
         nb = b / d
         nc = c / d
@@ -265,7 +264,7 @@ def cost_gradient_at(robot, scene, q, pair_distances, margin, self_margin, work,
                 other_sphere = robot.spheres[t]
                 partner = placed(frames[ib], other_sphere)
                 offset = minus(at, partner)
-                d = length(offset) + _TINY
+                d = length(offset) + TINY
                 h = sphere[3] + other_sphere[3] + self_margin - d
                 if h > ZERO:
                     cost += HALF * h * h

@@ -39,10 +39,9 @@ from robotdiffuse.collision.kernels.simd import (
     store_vector,
     vector_in,
 )
-from robotdiffuse.core.kernels import ONE, ZERO, allocation_free, inner_kernel, kernel
+from robotdiffuse.core.kernels import ONE, TINY, ZERO, allocation_free, inner_kernel, kernel
 from robotdiffuse.robots.frame_kernel import cross, dot, minus, plus, times
 
-_TINY = np.float32(1e-9)
 _FAR = np.float32(1e9)
 
 
@@ -104,7 +103,7 @@ def to_solid(points, velocities, solid):
     r = r * copysign(ONE, w)
     if solid[16] > ZERO:
         from_axis = sqrt(u * u + v * v)
-        p = (u * p + v * q) / maximum(from_axis, _TINY)
+        p = (u * p + v * q) / maximum(from_axis, TINY)
         u = from_axis - solid[12]
         v = minimum(u, ZERO)  # u alone counts
     else:
@@ -116,7 +115,7 @@ def to_solid(points, velocities, solid):
     inside = minimum(maximum(maximum(u, v), w), ZERO)
     outside = maximum(u, ZERO), maximum(v, ZERO), maximum(w, ZERO)
     d = _length(outside)
-    return d + inside - solid[15], absolute(dot(outside, (p, q, r))) / maximum(d, _TINY)
+    return d + inside - solid[15], absolute(dot(outside, (p, q, r))) / maximum(d, TINY)
 
 
 @allocation_free(forceinline=True)
@@ -279,7 +278,7 @@ def pair_along(robot, p, swept, work):
             relative = minus(velocities, _velocity(twists, g, partners) if swept else still)
             offset = minus(centers, partners)
             distance = _length(offset)
-            towards = absolute(dot(offset, relative)) / maximum(distance, _TINY)
+            towards = absolute(dot(offset, relative)) / maximum(distance, TINY)
             _lower_to(distance - (spheres[s, 3] + spheres[t, 3]), towards, work)
 
 

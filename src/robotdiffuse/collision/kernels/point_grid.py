@@ -30,14 +30,13 @@ from robotdiffuse.collision.kernels.simd import (
     sqrt,
     vector_in,
 )
-from robotdiffuse.core.kernels import HALF, ONE, ZERO, allocation_free, inner_kernel, kernel
+from robotdiffuse.core.kernels import HALF, ONE, TINY, ZERO, allocation_free, inner_kernel, kernel
 from robotdiffuse.robots.frame_kernel import dot, length, minus, plus, times, write
 
 POINT_RANGE = np.float32(0.3)
 """Points farther than this beyond the robot's reach are left out; clearances to points are capped at this
 value [m]."""
 _MIDDLE = HALF, HALF, HALF
-_TINY = np.float32(1e-9)
 # Upper bound on the rounding error of a distance within the grid [m]
 _SLACK = np.float32(1e-5)
 
@@ -424,7 +423,7 @@ def near_point(scene, at, limit):
         if p < 0:
             continue
         offset = minus(at, points[p])
-        d = length(offset) + _TINY
+        d = length(offset) + TINY
         if d - points[p, 3] < best:
             best = d - points[p, 3]
             gradient = times(ONE / d, offset)

@@ -19,7 +19,7 @@ import numpy as np
 from robotdiffuse.collision.kernels.motions import distance, make_scratch, motion_free
 from robotdiffuse.collision.kernels.random import random
 from robotdiffuse.collision.kernels.simd import W, lane, load
-from robotdiffuse.core.kernels import HALF, ONE, ZERO, allocation_free, inner_kernel, kernel
+from robotdiffuse.core.kernels import HALF, ONE, TINY, ZERO, allocation_free, inner_kernel, kernel
 
 _TAU = np.float32(6.283185307179586)
 INFINITE = np.float32(np.inf)
@@ -431,12 +431,12 @@ def sample_within(space, start, goal, bound, q, state):
     along = ZERO
     total = ZERO
     for j in range(dof):
-        v = (ONE if j == 0 else ZERO) - (goal[j] - start[j]) / max(c_min, np.float32(1e-9))
+        v = (ONE if j == 0 else ZERO) - (goal[j] - start[j]) / max(c_min, TINY)
         along += v * q[j]
         total += v * v
     for j in range(dof):
-        v = (ONE if j == 0 else ZERO) - (goal[j] - start[j]) / max(c_min, np.float32(1e-9))
-        turned = q[j] - (np.float32(2.0) * along / total * v if total > np.float32(1e-9) else ZERO)
+        v = (ONE if j == 0 else ZERO) - (goal[j] - start[j]) / max(c_min, TINY)
+        turned = q[j] - (np.float32(2.0) * along / total * v if total > TINY else ZERO)
         q[j] = min(max(turned + HALF * (start[j] + goal[j]), space.lower[j]), space.upper[j])
 
 

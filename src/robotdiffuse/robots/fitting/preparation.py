@@ -23,7 +23,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, check_name, joined, shown
 from robotdiffuse.core.files import lock_folder
-from robotdiffuse.core.transforms import seen_from
+from robotdiffuse.core.transforms import box_around, seen_from
 from robotdiffuse.core.types import NO_SPHERES, Mask, Points, Poses, Spheres
 from robotdiffuse.robots.bodies import Surface
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, convex_parts
@@ -109,8 +109,8 @@ def hidden_by_neighbors(robot: Robot, link: str) -> Callable[[Points], Mask]:
     for name, poses in neighbors(robot, link):
         meshes = robot.meshes[name]
         corners = np.concatenate([mesh.vertices for mesh in meshes])
-        box = corners.min(0) - BOX_PADDING, corners.max(0) + BOX_PADDING
-        neighbor_planes.append((poses, *box, stacked_planes(meshes)))
+        low, high = box_around(corners)
+        neighbor_planes.append((poses, low - BOX_PADDING, high + BOX_PADDING, stacked_planes(meshes)))
 
     def hidden(points: Points) -> Mask:
         hidden_points = np.zeros(len(points), bool)

@@ -25,6 +25,7 @@ from numpy import ndarray
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from robotdiffuse.core.transforms import box_around
 from robotdiffuse.core.types import NO_SPHERES, Mask, Points, Spheres, Values, Vector, for_kernels
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_parts import planes_of
@@ -124,8 +125,7 @@ class Solid(NamedTuple):
     def of(meshes: tuple[ConvexMesh, ...], tolerance: float) -> "Solid":
         """The solid, with a grid large enough for spheres that stick out by a tolerance [m]."""
         corners = np.concatenate([mesh.vertices for mesh in meshes])
-        low = corners.min(0)
-        high = corners.max(0)
+        low, high = box_around(corners)
         padding = max(MIN_PADDING, tolerance)
         spacing = max(float(np.prod(high - low + 2 * padding) / GRID_POINTS) ** (1 / 3), MIN_SPACING)
         low = low - padding - 2 * spacing
