@@ -102,7 +102,7 @@ def creased(vertices: Points, faces: Int[ndarray, "f 3"], colors: Float[ndarray,
     summed = [
         np.bincount(mine[alike], scaled[face[partner[alike]], i], minlength=len(owner)) for i in range(3)
     ]
-    normals = np.stack(summed, axis=1).astype(np.float64)  # integers if no face has an area
+    normals = np.stack(summed, axis=1).astype(np.float64)  # bincount of no corners gives integers
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     # corners with the same vertex, normal and color become one vertex of the surface
     keys = np.column_stack([owner, np.round(normals * 100), np.round(colors[face] * 255)]).astype(np.int64)

@@ -112,7 +112,7 @@ def test_an_empty_proof_of_one_row_is_none(with_times: bool) -> None:
     proof = StretchProof(claims, Stretches(none.astype(int), none, none), none.astype(bool), none, none, ())
     parts = robot_parts(robot), scene_parts(problem.scene), hash_of(motion)
     certificate = rd.Certificate(robot.name, *parts, Tolerances(), motion, none, 0.5, 0.5, proof)
-    missing = tuple(f"proof: {describe_claim(claim)} is missing from row 0 to row 0" for claim in claims)
+    missing = tuple(f"proof: {describe_claim(claim)} has a gap or an overlap between rows 0 and 0" for claim in claims)
     assert certificate.check(problem).differences == missing
 
 

@@ -1,12 +1,13 @@
 """The checker of proofs. It needs no search, and shares only data types, the motion of single joints,
 problem files and transforms with the validator.
 
-A claim says that a link stays clear of the scene, or of another link. It is proved for stretches of the
-motion, intervals between rows: the clearance in the middle of a stretch exceeds the displacement, which is
-how far the link can move within it. The proof must contain every claim that follows from the robot (see
-`bounds.py`), and the stretches of each claim must cover the motion without a gap. The checker recomputes the
-clearance and displacement of every stretch. They must agree with the proof, and the clearance must exceed the
-displacement. So a proof that passes is right, no matter how it was made.
+A claim says that a link stays clear of the scene, or of another link. It is proved for stretches (intervals)
+of the motion, which may begin and end between its rows (configurations): the clearance in the middle of a
+stretch exceeds the displacement, which is how far the link can move within it. The proof must contain every
+claim that follows from the robot (see `bounds.py`), and the stretches of each claim must cover the motion
+without a gap. The checker recomputes the clearance and displacement of every stretch. They must agree with
+the proof, and the clearance must exceed the displacement. So a proof that passes is right, no matter how it
+was made.
 """
 
 from collections.abc import Iterator
@@ -214,7 +215,7 @@ def _gaps(proof: StretchProof, last: float) -> Iterator[str]:
         broken = np.flatnonzero((edges[0] != edges[1]) | np.append(stop < start, not len(rows)))
         if len(broken):
             low, high = (float(side[broken[0]]) for side in edges)
-            yield f"proof: {describe_claim(claim)} is missing from row {low:g} to row {high:g}"
+            yield f"proof: {describe_claim(claim)} has a gap or an overlap between rows {low:g} and {high:g}"
 
 
 def describe_claim(claim: Claim) -> str:

@@ -36,7 +36,7 @@ MAX_VOXELS = 1e6
 def thin_points(points: Points, radius: float, reach: float) -> Spheres:
     """One sphere per occupied voxel, large enough to contain the spheres of all the voxel's points [m].
 
-    Points more than POINT_RANGE beyond `reach` [m] are left out.
+    Points whose spheres are more than POINT_RANGE beyond `reach` [m] are left out.
     """
     with np.errstate(over="ignore"):
         points = points[np.einsum("ij,ij->i", points, points) <= (reach + POINT_RANGE + radius) ** 2]

@@ -686,7 +686,7 @@ class PlanResult:
     self_clearance: float | Any = None
     """Lower bound on the distance between links [m]."""
     notes: tuple[str, ...] = field(default=())
-    """Input that was changed or ignored, e.g. a start clamped to a limit."""
+    """Changes to the input and exceptions, e.g. a start clamped to a limit, or a smaller clearance."""
     goal_index: int | None = None
     """Index from 0 of the goal where the motion ends, among the goals of an `AnyGoal` or the rows of several
     goal configurations; 0 for a single goal, None without a motion."""

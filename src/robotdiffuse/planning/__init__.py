@@ -226,8 +226,8 @@ def plan(
         velocity_scaling: Fraction of the velocity limits that the motion uses, from 0.001 to 1.
         acceleration_scaling: Fraction of the acceleration limits that the motion uses, from 0.001 to 1.
         jerk: Largest jerk of any joint [rad/s³], at least 0.01. None: each joint's own jerk limit; for a
-            joint without one, 10 times its acceleration limit, per second. Infinite (`--jerk none`): no
-            limit.
+            joint without one, 10 times its acceleration limit, per second. Infinite (on the command line:
+            `none`): no limit.
         objective: What aorrtc, rrt_connect and robotdiffuse minimize: "time", the motion's duration, or
             "length" of the path in joint space.
         planner: A name that `robotdiffuse planner list` shows. A planner stays loaded for later calls with

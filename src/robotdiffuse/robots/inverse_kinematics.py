@@ -62,9 +62,9 @@ def inverse_kinematics(
 ) -> Configurations:
     """Up to `count` distinct configurations that bring link `frame` to the pose, inside the joint limits.
 
-    Damped Newton steps (Levenberg-Marquardt) start from uniformly random seeds. Steps are clipped to the
-    limits, and joints pushed against a limit are held while the other joints move. Joints after the link keep
-    the random values of the seed. The result depends only on the arguments and the state of `rng`.
+    Damped Newton steps (Levenberg-Marquardt) start from random seeds (see `random_seeds`). Steps are clipped
+    to the limits, and joints pushed against a limit are held while the other joints move. Joints after the
+    link keep the random values of the seed. The result depends only on the arguments and the state of `rng`.
 
     Args:
         robot: The robot.

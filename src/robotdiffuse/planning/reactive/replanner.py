@@ -111,7 +111,7 @@ class SpeedProfile(NamedTuple):
         """What remains of the motion at a time [s] after its beginning."""
         s, speed = states_at(self.s, self.speeds, np.array([time]))
         later = self.s > s + 1e-12
-        # nothing remains: the arm rests, also if rounding leaves a speed
+        # if nothing remains, the arm rests, even if rounding leaves a speed
         return SpeedProfile(np.append(s, self.s[later]), np.append(speed * later.any(), self.speeds[later]))
 
     @property
@@ -521,8 +521,8 @@ class Replanner:
         self._since = -np.inf
         self._motion = AT_REST
         self._must_leave = self._is_goal(problem.start)
-        """Whether the path must be left where the current motion ends, because the goal has changed, or
-        because the arm was at the goal from the start."""
+        """Whether the arm must not follow the path beyond the end of its current motion: the goal has
+        changed, or the arm was at the goal from the start."""
         self._rehearse()
 
     def _rehearse(self) -> None:
