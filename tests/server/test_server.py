@@ -279,7 +279,7 @@ def test_cancelling_a_request_by_name_keeps_its_worker(server: httpx.Client) -> 
         until(lambda: gauge(server, "workers_busy") == 1)
         assert server.post("/plan", json=asked(), headers=named).status_code == 409
         assert server.delete("/requests/mine%2F1").status_code == 200
-    assert hangs.result().status_code == 409 and error(hangs.result()) == "the request was cancelled"
+    assert hangs.result().status_code == 409 and error(hangs.result()) == "the request was canceled"
 
 
 def test_a_client_that_disconnects_frees_its_worker(server: httpx.Client) -> None:

@@ -39,6 +39,7 @@ class Parser(argparse.ArgumentParser):
         choice = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
         if choice:
             message += suggestion(choice[1], re.findall(r"'(.*?)'", choice[2]))
+        # InputError puts the message on one line and shortens long words
         self.exit(BAD_INPUT, f"{self.prog}: error: {InputError(message)}; see {self.prog} --help\n")
 
 
@@ -67,8 +68,8 @@ def build_parser() -> Parser:
 
 @contextmanager
 def _repeated_interrupts() -> Iterator[None]:
-    """Within the block, signals of STOPS raise KeyboardInterrupt with their number. One that is lost in a
-    callback, as while compiled code is loaded, is repeated until it arrives."""
+    """Within the block, signals of STOPS raise KeyboardInterrupt with their number. If it is lost in a
+    callback, such as one that runs while compiled code is loaded, it is raised again until it arrives."""
     report = sys.unraisablehook
     stopped_by = signal.SIGINT
 
@@ -85,7 +86,7 @@ def _repeated_interrupts() -> Iterator[None]:
             report(lost)
 
     def repeat(_number: int, frame: Any) -> None:
-        if frame.f_code is schedule.__code__:
+        if frame.f_code is schedule.__code__:  # an exception within `schedule` would be lost for good
             signal.setitimer(signal.ITIMER_REAL, RETRY_DELAY)
         else:
             signal.raise_signal(stopped_by)

@@ -14,9 +14,9 @@ STOPS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
 
 @contextmanager
 def handled(handler: Callable[[int, Any], None], *signals: int) -> Iterator[None]:
-    """Within the block, signals call the handler, except signals that are ignored, as Ctrl-C is by background
-    jobs, or that code in C handles. Signals reach only the main thread; in any other thread, the block
-    changes nothing."""
+    """Within the block, signals call the handler, except those that code in C handles and those that are
+    ignored, as background jobs ignore Ctrl-C. Signals reach only the main thread; in any other thread, the
+    block changes nothing."""
     before = {}
     with suppress(ValueError):  # in another thread
         for number in signals:
@@ -73,7 +73,7 @@ def exit_fast(run: Callable[[], int]) -> NoReturn:
                 stream.flush()
         os._exit(status)
 
-    atexit.register(leave)  # handlers run in reverse order, so this one runs last
+    atexit.register(leave)  # handlers run in reverse order: the first one, this, runs last
     try:
         status = run()
     except SystemExit:  # with a status of its own

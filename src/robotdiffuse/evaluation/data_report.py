@@ -204,7 +204,7 @@ def tables(data: DataFigures) -> list[Table]:
 
 # The page
 
-BINS = 50
+BIN_EDGES = 50
 LAST_QUANTILE = 0.995
 """Histograms end at this quantile of the values; the last bar includes all larger values."""
 
@@ -264,7 +264,7 @@ def _motions(data: DataFigures) -> Histograms:
         values = column.scale * data.all[name]
         high = max(np.quantile(values[chosen], LAST_QUANTILE) if chosen.any() else 0.0, low + 1e-3)
         parts = {family: values[rows & chosen] for family, rows in data.families.items()}
-        panels[column.title] = np.linspace(low, high, BINS), parts
+        panels[column.title] = np.linspace(low, high, BIN_EDGES), parts
     return panels
 
 
@@ -280,5 +280,5 @@ def _goals(data: DataFigures) -> Histograms:
     end = np.quantile(excess, LAST_QUANTILE) if len(excess) else 1.0
     return {
         "goals": (np.arange(costs.shape[1] + 1) + 0.5, numbers),
-        "excess cost of the others [%]": (np.linspace(0, end, BINS), {"others": excess}),
+        "excess cost of the others [%]": (np.linspace(0, end, BIN_EDGES), {"others": excess}),
     }

@@ -262,8 +262,8 @@ def check_weights(name: str, folder: str | Path | None) -> None:
 
 
 def weights_folder(name: str, folder: str | Path | None, robot: Robot) -> Path:
-    """The folder with weights of a network: the given folder, the folder from `weights_for`, or the bundled
-    one of the robot's name, even though it is for another arm.
+    """The folder with weights of a network: the given folder, else the folder from `weights_for`. If there is
+    neither, the bundled folder of the robot's name: its weights are for another arm, as the caller reports.
 
     Raises InputError if there are no such weights, naming the command that trains them.
     """
@@ -274,7 +274,7 @@ def weights_folder(name: str, folder: str | Path | None, robot: Robot) -> Path:
         return fitting
     bundled = BUNDLED / robot.name
     if (bundled / f"{name}.json").is_file():
-        return bundled  # the caller reports that it is for another arm
+        return bundled
     raise no_weights_error(name, f"no weights of the network {name} come with the package for {robot.name}")
 
 

@@ -130,7 +130,8 @@ PAYLOAD_FIELDS = {"mass": NUMBER, "com": NUMBERS, "link": TEXT, "moments": NUMBE
 MOTION_FIELDS = ("velocity", "times", "poses", "max_speed")
 WRITTEN_DECIMALS = 15
 """Decimals of computed poses and points in files. Rounding restores most values up to about 1 that a user
-wrote, e.g. 0.3 for 0.30000000000000004; with fewer decimals, the hashes of clouds would change."""
+wrote, e.g. 0.3 for 0.30000000000000004. With fewer decimals, a cloud that is read from the file would have
+another hash than the cloud that was written."""
 
 
 def _fields_of(kind: type) -> tuple[dict[str, Schema], list[str]]:

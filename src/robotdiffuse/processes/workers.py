@@ -45,9 +45,9 @@ TERMINATE_TIMEOUT = 5.0
 PREPARE_TIMEOUT = 600.0
 """Time for a process to prepare, until it is killed [s]."""
 CANCEL_TIMEOUT = 1.0
-"""Time for a worker to leave a cancelled call, until it is killed [s]."""
+"""Time for a worker to leave a canceled call, until it is killed [s]."""
 CHECK_INTERVAL = 0.05
-"""Time between two checks whether a call takes too long or is cancelled [s]."""
+"""Time between two checks whether a call takes too long or is canceled [s]."""
 RESTART_DELAY = 1.0
 """Time between two attempts to start a worker that is kept ready [s]."""
 MAX_WORKERS = 1024

@@ -196,7 +196,7 @@ class Health(BaseModel):
 
 
 class Cancelled(BaseModel):
-    """The request that was cancelled."""
+    """The request that was canceled."""
 
     cancelled: str = Field(description="its X-Request-ID")
 
@@ -219,7 +219,7 @@ ERRORS = {
     401: "the token is missing or wrong",
     404: "no such request is running",
     408: "the request did not arrive in time",
-    409: "the request was cancelled, or its X-Request-ID is in use",
+    409: "the request was canceled, or its X-Request-ID is in use",
     413: "the request is too large, or needs more memory than a worker may use",
     415: "wrong Content-Type",
     421: "wrong Host",
@@ -476,8 +476,8 @@ def endpoint_list(app: FastAPI) -> str:
 def _cancellable(
     request: Request, name: str, running: dict[str, Callable[[], None]], tasks: list[asyncio.Task[Answer]]
 ) -> Iterator[asyncio.Future[None]]:
-    """Within the block, the tasks of a request can be cancelled by the request's name. Tasks that the block
-    leaves unfinished are cancelled. Yields a future that is done once the client has closed the connection.
+    """Within the block, the tasks of a request can be canceled by the request's name. Tasks that the block
+    leaves unfinished are canceled. Yields a future that is done once the client has closed the connection.
     Raises RequestError for a name that is too long or in use."""
     disconnected = asyncio.ensure_future(wait_for_disconnect(request))
 
@@ -571,11 +571,11 @@ async def wait_for_disconnect(request: Request) -> None:
 
 
 async def answer_of(task: asyncio.Task[Answer], disconnected: asyncio.Future[None]) -> Answer:
-    """The answer of the task, or an error if it is cancelled or the client disconnects first."""
+    """The answer of the task, or an error if it is canceled or the client disconnects first."""
     await asyncio.wait({task, disconnected}, return_when=asyncio.FIRST_COMPLETED)
     if not task.done():
         return failed(CLIENT_GONE, "the client closed the connection")
-    return failed(409, "the request was cancelled") if task.cancelled() else task.result()
+    return failed(409, "the request was canceled") if task.cancelled() else task.result()
 
 
 def plan_tasks(pool: WorkerPool, lines: list[bytes], at_once: int) -> list[asyncio.Task[Answer]]:

@@ -73,7 +73,7 @@ class Answer(NamedTuple):
 
 
 class Cancelled(BaseException):
-    """The call was cancelled."""
+    """The call was canceled."""
 
 
 # Robots that requests may name
@@ -126,7 +126,7 @@ def respond(endpoint: str, body: bytes) -> Answer:
 def _answer_of(endpoint: str, body: bytes) -> Answer:
     try:
         with cancel_check(_raise_if_cancelled):
-            check_cancelled()  # the call may have been cancelled before it began
+            check_cancelled()  # the call may have been canceled before it began
             return (answer_plan if endpoint == PLAN else answer_verify)(body)
     except InputError as error:
         return failed(400, str(error))

@@ -162,7 +162,7 @@ class Metrics:
         self._requests = counter(
             "requests",
             "Answers of the worker pool by endpoint and HTTP status code; each line of a batch counts; "
-            "requests refused because the queue is full, and cancelled ones, do not.",
+            "requests refused because the queue is full, and canceled ones, do not.",
             ("endpoint", "code"),
         )
         self._results = counter("results", "Results by endpoint and status.", ("endpoint", "status"))

@@ -194,7 +194,7 @@ def test_constraints_that_are_not_followed_are_noted(tmp_path: Path) -> None:
     assert "the limits of tendon t are ignored" in tree.notes
     notes = [note for note in tree.robot().notes if "equality" in note]
     for note, kind in zip(notes, ("joint", "connect", "tendon"), strict=True):
-        assert f"({kind}) is ignored; hold what it ties" in note
+        assert f"({kind}) is ignored; --lock can hold what it ties" in note
 
 
 PLACED = (FILES / "placed.xml").read_text()

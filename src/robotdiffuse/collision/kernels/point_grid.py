@@ -4,9 +4,9 @@ distances to points.
 A point is a sphere: its center and a radius. For the center of each voxel, the grid stores the index of the
 nearest point and the distance to that point's center. Both are exact within a band around the points. Beyond
 the band, the distance is a lower bound. The index there is that of a nearby point, which need not be the
-nearest one, or -1. A query at distance e from the center of its voxel knows its own distance to within e. If
-this is not precise enough, the query computes the distances to the points in the cells around.
-`point_cloud_grid.py` builds the arrays, which are fields of SceneArrays.
+nearest one, or -1. For a query at distance e from the center of its voxel, the grid gives the distance to the
+nearest point to within e. If this is not precise enough, the query computes the distances to the points in
+the cells around. `point_cloud_grid.py` builds the arrays, which are fields of SceneArrays.
 
 Coordinates called f are in voxels from the grid's origin; c is f clamped to the grid. i is the
 voxel, e the offset from the voxel's center, and o = f - c the offset of a query outside the grid. Entries of

@@ -189,8 +189,8 @@ def line(space, limits, a, b):
 
 @kernel(nogil=True)
 def simplify(space, limits, path, rounds, tries, state):
-    """A simpler path with the start and goal of `path`. First `tries` shortcuts between
-    random waypoints are tried, and waypoints that a straight piece can skip are removed. Then each of
+    """A simpler path with the start and goal of `path`. First, up to `tries` shortcuts
+    between random waypoints are tried, and waypoints that a straight piece can skip are removed. Then each of
     `rounds` rounds smooths the corners. At the end, waypoints that can be skipped are removed again."""
     scratch = make_scratch(space, path)
     points = _finer(path)

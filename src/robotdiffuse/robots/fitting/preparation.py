@@ -338,8 +338,8 @@ def _refined(
     """The robot with finer parts and spheres, or with tables, for pairs of links with many false collisions;
     `k` is the number of refinements before."""
     worst_pairs = _worst(false_collisions, settings.max_false_collisions)
-    # A table is computed from the parts of its pair and replaces their spheres, so these parts need to be
-    # finer only at the places in `coarse`.
+    # A table replaces the spheres of its pair and is computed from the pair's parts. So only where parts
+    # collide falsely, at the places in `coarse`, do they need to be finer.
     table_pairs = {pair.links for pair in worst_pairs if _beyond_spheres(robot, pair, settings, k)}
     coarse_links = {
         name

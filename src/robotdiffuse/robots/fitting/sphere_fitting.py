@@ -75,7 +75,7 @@ class Bounds(NamedTuple):
     does not apply."""
     floor: tuple[Vector, float] | None = None
     """Upward normal n and offset [m] of a plane: spheres may not contain points x with n . x below the
-    offset. At heights above it of less than `tolerance`, `hidden` does not apply."""
+    offset. At points less than `tolerance` above the plane, `hidden` does not apply."""
 
     @property
     def varies(self) -> bool:

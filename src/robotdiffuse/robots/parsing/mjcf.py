@@ -265,7 +265,7 @@ class ConvertedModel:
                 continue
             if kind != "joint" or leader not in movable or any(higher):
                 self.notes.append(
-                    f"equality {self.name('equality', k)} ({kind}) is ignored; hold what it ties by --lock"
+                    f"equality {self.name('equality', k)} ({kind}) is ignored; --lock can hold what it ties"
                 )
                 continue
             start = model.qpos0[model.jnt_qposadr[[follower, leader]]]

@@ -193,7 +193,8 @@ ALL = "all"
 """Name of the group of all arms, for any number of arms from two on."""
 FINGER = re.compile("finger|fngr|jaw|claw|knuckle|thumb", re.IGNORECASE)
 """Matches names of fingers. If the last joint of an arm moves a link with such a name, and at least
-MIN_ARM_JOINTS own joints come before this joint, it counts as a gripper joint under any name."""
+MIN_ARM_JOINTS own joints (see `Arm.own_joints`) come before it, this joint counts as a gripper joint,
+whatever the joint's name is."""
 NO_TIP = re.compile("camera|optical|sensor|finger|_sc$", re.IGNORECASE)
 """Matches names of links that become the tip only if no other kind of link has the same parent: sensors,
 fixed fingers, and Franka's coarse collision geometry (`fr3_link7_sc`)."""
