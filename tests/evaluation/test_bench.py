@@ -279,7 +279,7 @@ def test_other_problems_of_the_same_name_are_refused(tmp_path: Path) -> None:
         (tmp_path / folder / "mine.jsonl").write_text(line)
     for _ in range(2):
         assert len(gather_cases([str(tmp_path / "a" / "mine.jsonl")], None, tmp_path / "out", quiet)) == 1
-    with pytest.raises(rd.InputError, match=r"problems called mine that were read from .*; those in .* another content"):
+    with pytest.raises(rd.InputError, match=r"problems called mine that were read from .*; those in .* differ: rename"):
         gather_cases([str(tmp_path / "b" / "mine.jsonl")], None, tmp_path / "out", quiet)
     (tmp_path / "rop.jsonl").write_text(lines[0])
     refuses("a is an input of this command", gather_cases, [str(tmp_path / "a")], None, tmp_path / "a", quiet)

@@ -199,8 +199,8 @@ class Planner:
             pc: MPlib 0.1's name of `points`.
             radius: MPlib 0.1's name of `resolution`.
         """
-        min_radius = positive(CLOUD, "radius", resolution if radius is None else radius)
-        self.workspace.add(PointCloud(points if pc is None else pc, max(min_radius, 1e-3), name=name))
+        radius = positive(CLOUD, "radius", resolution if radius is None else radius)
+        self.workspace.add(PointCloud(points if pc is None else pc, max(radius, 1e-3), name=name))
 
     def remove_point_cloud(self, name: str = CLOUD) -> bool:
         """Remove a point cloud; returns whether there was one."""

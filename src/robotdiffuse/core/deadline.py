@@ -49,7 +49,7 @@ def cancel_check(check: Callable[[], None]) -> Iterator[None]:
 
 
 def check_cancelled() -> None:
-    """Raise the exception of `cancel_check` if the call is cancelled."""
+    """Raise the exception of `cancel_check` if the call is canceled."""
     _cancel_check.get()()
 
 
@@ -64,7 +64,7 @@ def check_timing(step: str, seconds: float = 0.0) -> None:
 
 def check_time(step: str, seconds: float = 0.0, what: str = PREPARING) -> None:
     """Raise OutOfTimeError if no time is left, or not enough for a step that takes about `seconds` [s]; see
-    LONG for short steps. Raises as `check_cancelled` does if the call is cancelled.
+    LONG for short steps. Raises as `check_cancelled` does if the call is canceled.
 
     what: PREPARING or TIMING, the work that the step is part of.
     """

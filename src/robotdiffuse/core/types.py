@@ -168,9 +168,9 @@ def frozen_dataclass(kind: type[T]) -> type[T]:
 class Value:
     """Base of the dataclasses that are values: the arrays and dictionaries in their fields are read-only.
 
-    Caches use the object's identity as the key, so values must not change. What is writable is copied, so
-    that the caller can still change it. A subclass that defines `__post_init__` calls this class's
-    `__post_init__` at its end.
+    Caches use the object's identity as the key, so values must not change. Writable arrays and dictionaries
+    are copied, so the caller may still change the originals. A subclass that defines `__post_init__` calls
+    this class's `__post_init__` at its end.
     """
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -307,9 +307,8 @@ class Trajectory(Value):
     """[rad/s²] or [m/s²]."""
 
     def __post_init__(self) -> None:
-        """Lists, integers and arrays whose shapes differ go through `check_motion_arrays`, which converts
-        them to arrays of floats or raises InputError. All other names and numbers are left to the
-        validator."""
+        """If the names are not a tuple, or the arrays are not float arrays of matching shapes,
+        `check_motion_arrays` converts them or raises InputError. Otherwise, the validator judges them."""
         names = self.joint_names
         arrays = {name: getattr(self, name) for name in ("positions", "times", *RATES)}
         q, t, v, a = (
@@ -686,7 +685,7 @@ class PlanResult:
     self_clearance: float | Any = None
     """Lower bound on the distance between links [m]."""
     notes: tuple[str, ...] = field(default=())
-    """Changes to the input and exceptions, e.g. a start clamped to a limit, or a smaller clearance."""
+    """Changes to the input or the request, e.g. a start clamped to a limit, or a smaller clearance."""
     goal_index: int | None = None
     """Index from 0 of the goal where the motion ends, among the goals of an `AnyGoal` or the rows of several
     goal configurations; 0 for a single goal, None without a motion."""

@@ -343,8 +343,8 @@ class BenchSettings(Settings):
     planners: Annotated[tuple[str, ...], Filled()]
     """Planners, each as text for `PlannerSpec.parse`; or only `all`."""
     problems: Annotated[tuple[str, ...], Filled()]
-    """Problem sets: families (rop, rop_dense, ...), FAMILY_nontrivial for a family without the problems
-    that a straight line solves, files or folders."""
+    """Problem sets: files, folders, families (rop, rop_dense, ...), or FAMILY_nontrivial for a family
+    without the problems that a straight line solves."""
     out: Path
     """Folder for problems and results."""
     time_limit: Positive = 1.0

@@ -80,8 +80,8 @@ class Report:
 
         body = MarkdownIt().enable("table").render(self.markdown)
         for file, svg in self.plots.items():
-            # make the ids unique: plots use the same ids, and a reference to an id in another plot draws
-            # nothing
+            # make the ids unique: plots use the same ids, and a plot's reference would find the id of an
+            # earlier plot, which draws nothing
             svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{Path(file).stem}-", svg)
             body = re.sub(rf'<img src="{re.escape(file)}"[^>]*>', lambda _, svg=svg: svg, body)
         titles = re.findall("<h2>(.*?)</h2>", body)

@@ -119,7 +119,7 @@ def gather_cases(names: list[str], count: int | None, out: FilePath, report: Pro
     Problems are stored in `out`/problems, one file for each set, and read from there next time. If `count` is
     then larger, problems of families are added. `report` is called with lines of text about the progress.
     Raises InputError for unknown and repeated names, for empty sets, if `out` is itself one of the sets, and
-    if a file or folder has another content than the problems that are stored under its name.
+    if the content of a file or folder differs from the problems that are stored under its name.
     """
     repeated_names = repeated(problem_set_name(text) for text in names)
     if repeated_names:
@@ -153,7 +153,7 @@ def _set(text: str, count: int | None, folder: FilePath, report: Progress) -> li
     elif source.is_file() and (stored := read_json(source))["sha256"] != about["sha256"]:
         raise InputError(
             f"{folder} has problems called {name} that were read from {stored['source']}; those in {text} "
-            "have another content: rename them, or use another output folder"
+            "differ: rename them, or use another output folder"
         )
     return _of_set(case_store.cases()[:count], name)
 

@@ -1,6 +1,6 @@
-"""Unknown space, which no view saw: assumptions about it, the unknown space that a motion passes through, and
-the motion's probability of being free; OccupancyMap: which voxels of 2 cm around the arm are free, occupied
-or unknown, updated view by view; and ViewMemory: keeps the views that showed most new voxels.
+"""Unknown space, which no view saw: assumptions about it, the part of it that a motion passes through, and
+the probability that the motion is free. `OccupancyMap` says which voxels of 2 cm around the arm are free,
+occupied or unknown, and is updated view by view. `ViewMemory` keeps the views that showed most new voxels.
 
 An assumption is a set of obstacles in addition to the observed ones. The space that the arm occupies at its
 start and goals is removed from them (carved out).
@@ -234,7 +234,7 @@ RATES: dict[str, float] = {
     "points padded by 4 cm": 0.5,
     "unknown is occupied": 0.99,
 }
-"""For each assumption, the fraction of the motions planned under it without a prediction that were free in
+"""For each assumption: of the motions planned under it without a prediction, the fraction that was free in
 the true scene. `python benchmarks/cameras.py --fit` prints these from its problems with even numbers."""
 
 UNSEEN_CONFIDENCE = 0.5
@@ -443,8 +443,8 @@ class OccupancyMap:
         """Add a view's evidence for each voxel. Returns the number of observed voxels without evidence
         before.
 
-        views: the view, if there is one. A point counts as an object that appears only if it is deeper in
-        free space than the view's errors may have displaced it.
+        views: the view, if there is one. A point is taken for a new object only if it is deeper in free
+        space than the view's errors may have displaced it.
         """
         self._now = max(self._now, stamp)
         self._known = None

@@ -84,7 +84,7 @@ class WorkerPool:
             self.admitted -= count
 
     async def run(self, endpoint: str, body: bytes) -> Answer:
-        """The answer to a request, from the next idle worker. Cancelling this task cancels the worker's
+        """The answer to a request, from the next idle worker. Canceling this task cancels the worker's
         call."""
         began = time.monotonic()
         answer = await self._answer(endpoint, body)
@@ -137,7 +137,7 @@ class WorkerPool:
         return sum(worker.ready for worker in self._workers.workers)
 
     def state(self) -> dict[str, int]:
-        """The numbers of workers and waiting requests now, for /health."""
+        """The numbers of workers and waiting requests now, for /health and the metrics."""
         busy = sum(worker.busy for worker in self._workers.workers)
         return {
             "workers": self.settings.workers,

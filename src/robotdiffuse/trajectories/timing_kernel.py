@@ -37,9 +37,9 @@ width times the norm of the change of direction."""
 CORNER_INTERVALS = 8
 LINE_INTERVALS = 32
 MIN_SPEED_RATIO = 0.01
-"""At each grid point, ṡ² is at least this fraction of the previous ṡ² or, if that is less, of the greatest ṡ²
-there. Where a joint's q' changes sign, the limits would otherwise allow a speed after which the motion must
-stop."""
+"""From the greatest ṡ² at a grid point, the next ṡ² can be at least this fraction of the smaller one of the
+greatest ṡ² at both points. Where a joint's q' changes sign, the limits would otherwise allow a speed after
+which the motion must stop."""
 
 
 class RoundedLine(NamedTuple):

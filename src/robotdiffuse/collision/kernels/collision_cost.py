@@ -223,10 +223,9 @@ def cost_gradient_at(robot, scene, q, pair_distances, margin, self_margin, work,
     """Returns the collision cost of a configuration and adds its gradient to `grad`.
 
     The cost is the paper's hinge loss, squared. A sphere at signed distance D < S from the scene costs
-    (S - D)^2 / 2, where S is `margin` [m]. Two spheres of a checked pair of links cost the same expression of
-    their distance and `self_margin` [m]. `pair_distances` are the clearances of the pairs at q, at most
-    `self_margin` (`lane_clearance.pair_clearances_into`). A sufficiently negative margin turns off its part
-    of the cost.
+    (S - D)^2 / 2, where S is `margin` [m]. For two spheres of a checked pair of links, D is their distance
+    and S is `self_margin` [m]. `pair_distances` are the clearances of the pairs at q, at most `self_margin`
+    (`lane_clearance.pair_clearances_into`). A sufficiently negative margin turns off its part of the cost.
     """
     frames_of(robot, q, work.frames)
     frames = work.frames

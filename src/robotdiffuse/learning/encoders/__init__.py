@@ -52,7 +52,7 @@ SPREADS = (
 
 def curve_keys(points: Any) -> Any:
     """Positions of points along the Z-order curve (Morton 1966), as 63-bit integers. Neighbors along the
-    curve are close to each other. points: array or tensor [..., 3] [m]."""
+    curve are mostly close to each other. points: array or tensor [..., 3] [m]."""
     key = 0
     for axis in range(3):
         bits = (points[..., axis] / CURVE_STEP).round() + 2**20
@@ -146,7 +146,7 @@ class DGCNNSettings(EncoderSettings):
     edges: Sizes = (32, 32, 64)
     """Widths of the layers of edge convolution (64, 64, 128, 256)."""
     embedding: Count = 192
-    """Number of pooled features of a point, computed from the outputs of all edge convolutions (1024)."""
+    """Number of features of a point before pooling, from the outputs of all edge convolutions (1024)."""
     head: tuple[Count, ...] = (192,)
     """Widths of the layers between the pooled features and z (512, 256)."""
 
