@@ -241,7 +241,8 @@ def usable(problem: Problem, clearance: float) -> bool:
         return False
     exact = ExactCollision(problem.robot, problem.scene)
     ends = (problem.start, *problem.goal.positions)
-    return all(link.distance >= clearance for q in ends for link in exact.link_distances(q))
+    distances = [d for q in ends for d in exact.distances(q) if d.other not in problem.robot.link_names]
+    return all(link.distance >= clearance for link in distances)
 
 
 def run(arguments: argparse.Namespace) -> None:

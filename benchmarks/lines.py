@@ -22,7 +22,7 @@ import robotdiffuse as rd
 from common import header, parse, print_table, progress, use_processor_time
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.transforms import rotation_about, rotation_from_rpy, transform
-from robotdiffuse.problems.compiled_constraints import rotation_vector
+from robotdiffuse.problems.compiled_constraints import pose_difference
 from robotdiffuse.problems.files import SEED, held_out_problem
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
 from robotdiffuse.robots.robot import Robot
@@ -69,8 +69,7 @@ def drawn(kind: str) -> Iterator[tuple[rd.Problem, ndarray]]:
 def followed(robot: Robot, start: ndarray, end: ndarray) -> ndarray | None:
     """Configurations along the line by a plain follower; None if the follower does not reach the end."""
     T = robot.fk(start, HAND)
-    translation = end[:3, 3] - T[:3, 3]
-    turn = rotation_vector(end[:3, :3] @ T[:3, :3].T)
+    translation, turn = pose_difference(T, end)
     angle = float(np.linalg.norm(turn))
     axis = turn / angle if angle > 1e-9 else np.eye(3)[2]
     count = int(np.ceil(max(np.linalg.norm(translation) / STEP, angle / TURN_STEP)))
@@ -79,8 +78,7 @@ def followed(robot: Robot, start: ndarray, end: ndarray) -> ndarray | None:
         target = transform(T[:3, 3] + share * translation, rotation_about(axis, share * angle) @ T[:3, :3])
         q = rows[-1]
         for _ in range(MAX_ITERATIONS):
-            T_now = robot.fk(q, HAND)
-            error = np.append(target[:3, 3] - T_now[:3, 3], rotation_vector(target[:3, :3] @ T_now[:3, :3].T))
+            error = np.append(*pose_difference(robot.fk(q, HAND), target))
             if np.abs(error).max() < 1e-6:
                 break
             J = robot.jacobian(q, HAND)

@@ -147,7 +147,7 @@ def disagreements(world: World, robot: Robot, rows: ndarray) -> tuple[int, int, 
     for q in rows:
         world.place(robot, q)
         depths = [distance for *_, distance in world.contacts(robot)]
-        least = min(d.distance for d in (*exact.link_distances(q), *exact.pair_distances(q)))
+        least = min(d.distance for d in exact.distances(q))
         hits += any(depth < 0 for depth in depths)
         missed += min(depths, default=1.0) < -DEPTH and least > 0
         extra += least < -DEPTH and not any(depth < 0 for depth in depths)
@@ -161,8 +161,8 @@ def problems(file: Path, robot: Robot, rng: np.random.Generator) -> Iterator[tup
         exact = ExactCollision(robot, world.scene)
 
         def clear(q: ndarray, exact: ExactCollision = exact) -> bool:
-            obstacles = min(d.distance for d in exact.link_distances(q))
-            return obstacles > CLEAR and all(d.distance > 0.005 for d in exact.pair_distances(q))
+            wanted = {name: 0.005 for name in robot.link_names}
+            return all(d.distance > wanted.get(str(d.other), CLEAR) for d in exact.distances(q))
 
         for start in draw(robot, rng, 20):
             turned = start + rng.uniform(-TURN, TURN, robot.dof)

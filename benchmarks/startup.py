@@ -30,10 +30,7 @@ ROWS = 2000
 def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
     """Calls of compiled code that return numbers, by name."""
     import robotdiffuse as rd
-    from robotdiffuse.collision.batched_clearances import (
-        packed_clearances_and_gradients,
-        packed_link_clearances,
-    )
+    from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients
     from robotdiffuse.collision.checker import CollisionChecker
     from robotdiffuse.collision.kernel_arrays import compile_robot
     from robotdiffuse.learning.guidance import CollisionGuidance
@@ -80,8 +77,8 @@ def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
         "gradients": lambda: np.concatenate(checker.clearances_and_gradients(q, 0.3, 0.1), axis=1),
         "costs": lambda: checker.cost_gradients(q, 0.1)[1],
         "pairs of links": lambda: checker.pair_clearances(q),
-        "guidance": lambda: CollisionGuidance(checker)(batch, 8)[0],
-        "clearances in training": lambda: packed_link_clearances(arm, packed, batch, 0.3),
+        "guidance": lambda: CollisionGuidance(checker)(batch, 8),
+        "clearances in training": lambda: packed_clearances_and_gradients(arm, packed, batch, 0.3)[0],
         "gradients in training": lambda: np.concatenate(
             packed_clearances_and_gradients(arm, packed, batch, 0.3, 0.1), axis=-1
         ),

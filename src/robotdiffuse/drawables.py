@@ -57,7 +57,7 @@ class Surface:
         for i, (r, g, b) in enumerate(colors.tolist()):
             used, faces = np.unique(self.faces[face_color == i], return_inverse=True)
             arrays = self.vertices[used], self.normals[used], self.colors[used]
-            parts.append(((r, g, b), Surface(*arrays, faces.reshape(-1, 3))))
+            parts.append(((r, g, b), Surface(*arrays, faces)))
         return parts
 
 

@@ -15,7 +15,7 @@ from helpers.box_arm import box_arm
 from helpers.panda import PANDA
 from helpers.refusals import refuses
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients, packed_link_clearances
+from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernel_arrays import compile_robot, robot_groups
 from robotdiffuse.collision.kernels.lane_clearance import block_clearances
@@ -247,7 +247,7 @@ def test_inputs_are_the_same_in_training_and_planning() -> None:
     config = motion_model.MotionModelSettings(clearance_gradients=True)
     given = compile_robot(PANDA), packed, q, motion_model.MAX_CLEARANCE
     clearances, gradients = packed_clearances_and_gradients(*given, motion_model.GRADIENT_MARGIN)
-    np.testing.assert_array_equal(clearances, packed_link_clearances(*given))
+    np.testing.assert_array_equal(clearances, packed_clearances_and_gradients(*given)[0])
     told = np.concatenate([clearances, gradients], axis=-1)
     for i, scene in enumerate(scenes):
         checker = CollisionChecker(PANDA, scene)

@@ -27,7 +27,7 @@ coordinate = st.floats(-1.5, 1.5)
 
 
 def least(exact: ExactCollision, q: np.ndarray) -> float:
-    return min(d.distance for d in (*exact.link_distances(q), *exact.pair_distances(q)))
+    return min(d.distance for d in exact.distances(q))
 
 
 @given(coordinate, coordinate, st.floats(-0.5, 0.5), st.floats(0.01, 0.4))
@@ -35,7 +35,7 @@ def test_box_links_against_a_sphere_in_closed_form(x: float, y: float, z: float,
     exact = ExactCollision(box_arm(), rd.Scene([rd.Sphere((x, y, z), radius)]))
     lows = np.array([[start, -HALF_WIDTH, -HALF_WIDTH] for start in (0, 0.5, 0.9)])
     highs = np.array([[end, HALF_WIDTH, HALF_WIDTH] for end in (0.5, 0.9, 1.2)])
-    for found, low, high in zip(exact.link_distances(Q0), lows, highs, strict=True):
+    for found, low, high in zip(exact.distances(Q0)[:3], lows, highs, strict=True):
         right = float(distance(rd.Box((low + high) / 2, high - low), np.array([x, y, z]))) - radius
         # 1e-5: EPA, which finds the depth in an iteration, is left at Coal's own tolerance.
         assert found.distance == pytest.approx(right, abs=1e-6 if right > 0 else 1e-5)
@@ -48,7 +48,7 @@ def test_links_without_meshes_are_their_spheres() -> None:
         rd.Capsule((0.9, -0.4, 0), 0.1, 0.6),
         rd.Cylinder((-0.6, 0, 0), 0.2, 1.0, (np.sqrt(0.5), np.sqrt(0.5), 0, 0)),
     ]
-    found = ExactCollision(replace(box_arm(), meshes={}, spheres=spheres), rd.Scene(obstacles)).link_distances(Q0)
+    found = ExactCollision(replace(box_arm(), meshes={}, spheres=spheres), rd.Scene(obstacles)).distances(Q0)[:3]
     assert [one.other for one in found] == ["cylinder", "box", "capsule"]
     assert [one.distance for one in found] == pytest.approx([0.6 - 0.2 - 0.04, 0.35 - 0.04, 0.4 - 0.1 - 0.04])
 
@@ -56,9 +56,9 @@ def test_links_without_meshes_are_their_spheres() -> None:
 def test_pairs_of_links() -> None:
     exact = ExactCollision(box_arm(), rd.Scene())
     assert [check for check in exact.checks if check.other] == [("l1", "l3")]
-    (folded,) = exact.pair_distances(np.array([0.3, np.pi / 2, 0]))
+    folded = exact.distances(np.array([0.3, np.pi / 2, 0]))[-1]
     assert folded.distance == pytest.approx(0.4 - HALF_WIDTH, abs=1e-6)
-    (crossing,) = exact.pair_distances(np.array([1.0, 2.6, 2.6]))
+    crossing = exact.distances(np.array([1.0, 2.6, 2.6]))[-1]
     assert crossing.distance < 0 and crossing.other == "l3"
 
 
@@ -72,7 +72,7 @@ def test_a_point_cloud_is_many_spheres() -> None:
     assert 0.1 < hit.mean() < 0.9
     np.testing.assert_array_equal(cloud.collides(configurations), hit)
     for q in configurations:
-        for a, b in zip(cloud.link_distances(q), spheres.link_distances(q), strict=True):
+        for a, b in zip(cloud.distances(q)[:3], spheres.distances(q)[:3], strict=True):
             assert a.distance == pytest.approx(b.distance, abs=1e-6) if b.distance > 0 else a.distance <= 0
 
 
@@ -80,15 +80,15 @@ def test_a_point_cloud_is_many_spheres() -> None:
 def test_degenerate_point_clouds(points: np.ndarray) -> None:
     exact = ExactCollision(box_arm(), rd.Scene([rd.PointCloud(points + np.array([0.2, 0.5, 0]), 0.01)]))
     right = np.hypot(0.5 - HALF_WIDTH, max(points[0, 2] - HALF_WIDTH, 0)) - 0.01
-    assert exact.link_distances(Q0)[0].distance == pytest.approx(right, abs=1e-6)
+    assert exact.distances(Q0)[0].distance == pytest.approx(right, abs=1e-6)
 
 
 def test_a_link_deep_in_a_point_cloud_and_an_empty_cloud() -> None:
     points = np.stack([np.full(21, 0.25), np.linspace(-0.02, 0.02, 21), np.zeros(21)], axis=1)
     exact = ExactCollision(box_arm(), rd.Scene([rd.PointCloud(points, 0.01)]))
-    assert exact.link_distances(Q0)[0].distance == pytest.approx(-HALF_WIDTH - 0.01, abs=1e-5)
+    assert exact.distances(Q0)[0].distance == pytest.approx(-HALF_WIDTH - 0.01, abs=1e-5)
     exact = ExactCollision(box_arm(), rd.Scene([rd.PointCloud(np.zeros((0, 3)))]))
-    assert exact.link_distances(Q0)[0] == ("l1", None, np.inf)
+    assert exact.distances(Q0)[0] == ("l1", None, np.inf)
     assert not exact.collides(np.zeros((2, 3))).any()
 
 
@@ -98,7 +98,7 @@ def test_equal_points_are_one() -> None:
     cloud = rd.PointCloud(np.repeat(two, 500, axis=0) * 1.0, 0.01)
     assert np.array_equal(cloud.distinct_points, two)
     once, often = (ExactCollision(box_arm(), rd.Scene([one])) for one in (rd.PointCloud(two, 0.01), cloud))
-    assert once.link_distances(Q0) == often.link_distances(Q0)
+    assert once.distances(Q0) == often.distances(Q0)
 
 
 def test_a_mesh_is_its_surface() -> None:
@@ -194,8 +194,7 @@ def closer(gap: float) -> np.ndarray:
 
 
 def between_links(robot: rd.Robot, q: np.ndarray) -> float:
-    [pair] = ExactCollision(robot, EMPTY).pair_distances(q)
-    return pair.distance
+    return ExactCollision(robot, EMPTY).distances(q)[-1].distance
 
 
 @pytest.mark.parametrize("gap", [0.0002, 0.001, 0.0025, 0.0045])
@@ -292,7 +291,7 @@ def test_baxters_torso_and_arms_graze_as_trimesh_finds_too() -> None:
     links = ("torso", "left_lower_forearm")
     assert explain_collision(robot, EMPTY, q) is None
     assert explain_collision(replace(robot, surfaces={}, grazing=frozenset()), EMPTY, q) is not None
-    [found] = [d for d in ExactCollision(robot, EMPTY).pair_distances(q) if {d.link, d.other} == {*links}]
+    [found] = [d for d in ExactCollision(robot, EMPTY).distances(q) if {d.link, d.other} == {*links}]
     meshes = []
     for each in links:
         T = robot.fk(q, each)

@@ -47,7 +47,8 @@ def as_coal_sees(moves: rd.MovingObstacle, times: np.ndarray, q: np.ndarray) -> 
     while k < len(moments):
         now = moments[k]
         row = np.array([np.interp(now, times, column) for column in q.T])
-        near = min(d.distance for d in ExactCollision(PANDA, rd.Scene([moves.at(now)])).link_distances(row))
+        distances = ExactCollision(PANDA, rd.Scene([moves.at(now)])).distances(row)
+        near = min(d.distance for d in distances if d.other not in PANDA.link_names)
         least = min(least, near)
         if near <= 0:
             return now, least
@@ -84,7 +85,8 @@ def test_meshes_decide_for_a_single_row_too() -> None:
 def test_what_is_unknown_is_anywhere_that_it_can_be() -> None:
     """The arm rests beside a ball that may approach at 0.1 m/s: it is free until the ball can have reached it."""
     ball = rd.Sphere([0.3, 0.0, 1.4], 0.1)
-    gap = min(d.distance for d in ExactCollision(PANDA, rd.Scene([ball])).link_distances(START))
+    distances = ExactCollision(PANDA, rd.Scene([ball])).distances(START)
+    gap = min(d.distance for d in distances if d.other not in PANDA.link_names)
     validator = MovingCollision(PANDA, [rd.MovingObstacle(ball, max_speed=0.1)], 1e-4, 0.5)
     free = validator.sweep(np.array([0.0, 0.99 * gap / 0.1]), np.stack([START, START]))
     hit = validator.sweep(np.array([0.0, 1.5 * gap / 0.1]), np.stack([START, START]))

@@ -146,7 +146,7 @@ def test_objective_round_trip(name, as_given):
     objective = OBJECTIVES[name]
     clean, noise = map(as_given, np.random.default_rng(0).standard_normal((2, 201, 5, 2)))
     a, s = (as_given(v[:, None, None]) for v in (schedule.signal, schedule.noise))
-    back = objective.clean(a * clean + s * noise, objective.target(clean, noise, a, s), a, s)
+    back = objective.clean(a * clean + s * noise, objective.target(clean, noise), a, s)
     np.testing.assert_allclose(back, clean, atol=1e-9)
 
 

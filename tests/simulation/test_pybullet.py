@@ -201,7 +201,7 @@ def test_distances_agree_with_coal(name: str, locked: dict[str, float]) -> None:
     exact = ExactCollision(robot, scene)
     with PyBulletOracle(robot, scene) as oracle:
         for q in np.random.default_rng(0).uniform(robot.lower, robot.upper, (40, robot.dof)):
-            right = min(d.distance for d in (*exact.link_distances(q), *exact.pair_distances(q)))
+            right = min(d.distance for d in exact.distances(q))
             assert oracle.distance(q.tolist()) == pytest.approx(right, abs=TOLERANCE)
         refuses("q is", oracle.distance, q * np.nan)
 
@@ -274,7 +274,7 @@ def test_point_clouds_agree_with_coal() -> None:
     exact = ExactCollision(robot, scene)
     with PyBulletOracle(robot, scene) as oracle:
         for row in rng.uniform(robot.lower, robot.upper, (40, robot.dof)):
-            right = min(d.distance for d in (*exact.link_distances(row), *exact.pair_distances(row)))
+            right = min(d.distance for d in exact.distances(row))
             if right > 0:
                 assert oracle.distance(row) == pytest.approx(right, abs=TOLERANCE)
             if abs(right) > TOLERANCE:

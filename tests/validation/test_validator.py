@@ -58,8 +58,8 @@ def test_a_free_motion_is_accepted_with_a_certified_clearance() -> None:
     report = validator(SWING, *shapes)
     assert report.valid and report.violation is None
     exact = ExactCollision(box_arm(), rd.Scene(shapes))
-    for found, distances in ((report.scene_clearance, exact.link_distances), (report.self_clearance, exact.pair_distances)):
-        least = min(d.distance for q in dense(SWING, 0.01)[0] for d in distances(q))
+    every = np.array([[d.distance for d in exact.distances(q)] for q in dense(SWING, 0.01)[0]])
+    for found, least in ((report.scene_clearance, every[:, :3].min()), (report.self_clearance, every[:, 3:].min())):
         assert found is not None
         # Spheres stick out of the boxes by 2 cm, towards each other by 4; the certificate may give away half.
         assert 0.5 * (least - 0.04) <= found <= least
@@ -110,7 +110,7 @@ def test_the_certificate_agrees_with_dense_sampling(seed: int, count: int) -> No
     hits = exact.collides(q)
     if report.valid:
         assert not hits.any() and report.min_clearance is not None
-        assert 0 < report.min_clearance <= min(d.distance for row in q[::50] for d in exact.link_distances(row))
+        assert 0 < report.min_clearance <= min(d.distance for row in q[::50] for d in exact.distances(row))
         return
     found = report.violation
     assert found is not None and found.excess is not None
@@ -119,7 +119,7 @@ def test_the_certificate_agrees_with_dense_sampling(seed: int, count: int) -> No
         return
     # The first contact is located to 1 mm of motion, and counts from a gap of 0.1 mm on.
     here = np.stack([np.interp(found.time, np.arange(count), column) for column in rows.T])
-    distances = [d for d in (*exact.link_distances(here), *exact.pair_distances(here)) if d.link == found.subject]
+    distances = [d for d in exact.distances(here) if d.link == found.subject]
     assert min(d.distance for d in distances) <= 1.001e-4 and not hits[at < found.time - 0.02].any()
     assert found.time <= at[hits].min() + 1e-6 + 0.01
 
@@ -443,7 +443,7 @@ def test_clearance_is_that_of_the_cubic(bulge: float, gap: float) -> None:
     report = verified(motion, wall)
     exact = ExactCollision(box_arm(), rd.Scene([wall]))
     dense = motion.at(np.linspace(1.9, 3.1, 41)).positions
-    least = min(d.distance for q in dense for d in exact.link_distances(q))
+    least = min(d.distance for q in dense for d in exact.distances(q)[:3])
     if report.valid:
         assert report.scene_clearance is not None and 0 < report.scene_clearance <= least + 1e-9
     else:

@@ -39,7 +39,7 @@ def test_each_moment_has_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     problem, explorer, _ = recorded()
     monkeypatch.setattr(exploration, "TILE", PictureSettings(width=240, height=150, ghosts=1))
     exploration.write_exploration_picture(explorer, problem.scene, tmp_path / "explore.png")
-    count = len(exploration.moments(explorer))
+    count = len(explorer.steps)
     columns = min(count, 3 if count > 4 else 2)
     with Image.open(tmp_path / "explore.png") as image:
         width = columns * (240 + exploration.GAP) - exploration.GAP

@@ -34,7 +34,7 @@ from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import pose, transform
 from robotdiffuse.core.types import PlanResult
 from robotdiffuse.planning.workspace import Workspace
-from robotdiffuse.problems.compiled_constraints import rotation_vector
+from robotdiffuse.problems.compiled_constraints import pose_difference
 from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.bodies import RigidShape
@@ -401,9 +401,8 @@ class Planner:
         position, times TILT_MARGIN. Infinite if the arm cannot reach the position with any tilt."""
 
         def errors(q: ndarray) -> ndarray:
-            T = self.workspace.pose(q)
-            turn = rotation_vector(T[:3, :3] @ T_world_tip[:3, :3].T)
-            return np.append(T[:3, 3] - T_world_tip[:3, 3], TILT_WEIGHT * turn)
+            displacement, turn = pose_difference(T_world_tip, self.workspace.pose(q))
+            return np.append(displacement, TILT_WEIGHT * turn)
 
         robot = self.robot
         upper = np.maximum(robot.upper, robot.lower + 1e-6)  # SciPy refuses equal limits

@@ -150,7 +150,7 @@ class Control(Planner[ControlSettings]):
             q = bent(library(settings.data, robot), start, goals[0], settings.samples)
             q = np.clip(q, robot.lower, robot.upper)
         steps = settings.guidance_steps
-        return CollisionGuidance(checker)(q.astype(np.float32), steps)[0] if steps else q
+        return CollisionGuidance(checker)(q.astype(np.float32), steps) if steps else q
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""

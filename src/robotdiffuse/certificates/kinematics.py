@@ -19,7 +19,6 @@ from robotdiffuse.core.types import (
     Trajectory,
     Values,
 )
-from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import Robot
 
 
@@ -53,15 +52,13 @@ class Linkage:
                 moved[joint.child][self._planned[joint.name]] = True
         return np.stack([moved[link] for link in self.links])
 
-    def place(self, q: Configurations, link: str | None = None) -> Postures:
-        """Poses at configurations. If `link` is given, only links from the base to it are placed; the
-        poses of other links are 0."""
+    def place(self, q: Configurations) -> Postures:
+        """Poses at configurations."""
         n, dof = q.shape
-        T = np.zeros((n, len(self.links), 4, 4))
         origins = np.zeros((n, dof, 3))
         axes = np.zeros((n, dof, 3))
         at = {self.robot.base: np.tile(np.eye(4), (n, 1, 1))}
-        for joint in self.robot.joints if link is None else self._up_to(link):
+        for joint in self.robot.joints:
             T_base_joint = at[joint.parent] @ joint.T_parent_joint
             j = self._planned.get(joint.name)
             value = np.full(n, self.robot.locked.get(joint.name, 0.0)) if j is None else q[:, j]
@@ -69,26 +66,17 @@ class Linkage:
                 origins[:, j] = T_base_joint[:, :3, 3]
                 axes[:, j] = T_base_joint[:, :3, :3] @ joint.axis
             at[joint.child] = T_base_joint @ joint.motion(value)
-        for k, name in enumerate(self.links):
-            if name in at:
-                T[:, k] = at[name]
-        return Postures(T, origins, axes)
-
-    def _up_to(self, link: str) -> list[Joint]:
-        """Joints from the base to a link, parents first."""
-        chain = list[Joint]()
-        above = {joint.child: joint for joint in self.robot.joints}
-        while link in above:
-            chain.append(above[link])
-            link = above[link].parent
-        return chain[::-1]
+        return Postures(np.stack([at[link] for link in self.links], axis=1), origins, axes)
 
     def levers(self, link: str, q: Configurations) -> Values:
         """Upper bounds on the distance of a link's origin from the axis of each planned joint that moves it,
         base first [m]; 1 for a prismatic joint. q: rows that contain the extreme position of each joint."""
         bounds = list[float]()
         length = 0.0
-        for joint in reversed(self._up_to(link)):
+        above = {joint.child: joint for joint in self.robot.joints}
+        while link in above:
+            joint = above[link]
+            link = joint.parent
             j = self._planned.get(joint.name)
             if j is not None:
                 bounds.append(1.0 if self.slides[j] else length)

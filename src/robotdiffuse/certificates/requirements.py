@@ -98,12 +98,10 @@ def constraint_bounds(
     """
     linkage = Linkage(problem.robot)
     q = q if len(q) > 1 else np.repeat(q, 2, axis=0)
-    placed = {
-        frame: linkage.place(q, frame) for frame in {constraint.frame for constraint in problem.constraints}
-    }
+    postures = linkage.place(q)
     quantities = list[tuple[str, Values, float]]()
     for constraint in problem.constraints:
-        motion = _frame_motion(linkage, placed[constraint.frame], q, constraint.frame)
+        motion = _frame_motion(linkage, postures, q, constraint.frame)
         name = f"{constraint.kind} of {constraint.frame}"
         if isinstance(constraint, AxisCone):
             cosines = motion.R @ constraint.axis @ constraint.direction
@@ -176,7 +174,7 @@ def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> It
 
 def _frame_speeds(linkage: Linkage, cubics: Cubics, frame: str, row: ndarray, time: ndarray) -> Values:
     q, v, _ = cubics.at(row, time)
-    joints, rates = linkage.rates(linkage.place(q, frame), frame)
+    joints, rates = linkage.rates(linkage.place(q), frame)
     return np.linalg.norm((rates * v[:, joints, None]).sum(axis=1), axis=1)
 
 

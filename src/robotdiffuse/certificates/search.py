@@ -22,7 +22,6 @@ from numpy import ndarray
 from robotdiffuse.certificates.bounds import (
     CLEARANCE_CAP,
     SCENE,
-    Claim,
     MovingProver,
     Part,
     Plane,
@@ -75,47 +74,33 @@ class _Body(NamedTuple):
     """Pose of the body in the frame of its link, or in the base frame."""
 
 
-class PlaneFinder:
-    """Finds separating planes for the stretches of a prover."""
+def _planes(
+    prover: Prover, hulls: dict[str, list[_Body]], stretches: Stretches, needed: Values
+) -> Iterator[Plane]:
+    """Separating planes for the stretches of a prover.
 
-    def __init__(self, prover: Prover) -> None:
-        self.prover = prover
-        self._parts = {link: tuple(map(_hull, parts)) for link, parts in prover.parts.items()}
-
-    def planes(self, stretches: Stretches, needed: Values) -> list[Plane]:
-        """Separating planes for stretches.
-
-        needed: for each of the stretches, the clearance that it needs [m]. Bodies farther than this from the
-        part's ball get no plane, nor do bodies that touch.
-        """
-        prover = self.prover
-        T = prover.linkage.place(prover.at((stretches.start + stretches.stop) / 2)).T
-        return [
-            Plane(k, *plane)
-            for k, claim in enumerate(stretches.claim)
-            for plane in self._of(prover.claims[claim], T[k], float(needed[k]))
-        ]
-
-    def _of(self, claim: Claim, T: ndarray, needed: float) -> Iterator[tuple[int, int, Normal]]:
-        prover = self.prover
-        links = prover.linkage.links
-        T_base_link = T[links.index(claim.link)]
-        for p, (part, bodies, ball_gaps) in enumerate(prover.pairs(claim, T)):
-            first = self._parts[claim.link][p]
-            first = first._replace(T=T_base_link @ first.T)
-            for o in np.flatnonzero(ball_gaps < needed).tolist():
+    hulls: the parts of each link. needed: for each of the stretches, the clearance that it needs [m]. Bodies
+    farther than this from the part's ball get no plane, nor do bodies that touch.
+    """
+    poses = prover.linkage.place(prover.at((stretches.start + stretches.stop) / 2)).T
+    for k, claim_index in enumerate(stretches.claim):
+        claim = prover.claims[claim_index]
+        T_base_link = dict(zip(prover.linkage.links, poses[k], strict=True))
+        for p, (part, bodies, ball_gaps) in enumerate(prover.pairs(claim, poses[k])):
+            first = hulls[claim.link][p]
+            first = first._replace(T=T_base_link[claim.link] @ first.T)
+            for o in np.flatnonzero(ball_gaps < needed[k]).tolist():
                 body = bodies[o]
                 if isinstance(body, Surface):
-                    yield from ((p, o, normal) for normal in _around(first, part, body, needed))
-                    continue
-                if isinstance(body, Rounded):
-                    second = _Body(coal_rounded(*body[2:]), transform(body.center, body.R))
+                    normals = _around(first, part, body, float(needed[k]))
                 else:
-                    second = self._parts[claim.against][o]
-                    second = second._replace(T=T[links.index(claim.against)] @ second.T)
-                normal = _normal(first, second)
-                if normal is not None:
-                    yield p, o, normal
+                    if isinstance(body, Rounded):
+                        second = _Body(coal_rounded(*body[2:]), transform(body.center, body.R))
+                    else:
+                        second = hulls[claim.against][o]
+                        second = second._replace(T=T_base_link[claim.against] @ second.T)
+                    normals = filter(None, [_normal(first, second)])
+                yield from (Plane(k, p, o, normal) for normal in normals)
 
 
 def _around(first: _Body, part: Part, surface: Surface, needed: float) -> Iterator[Normal]:
@@ -328,7 +313,8 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
     todo = Stretches(np.arange(count), np.zeros(count), np.full(count, last))
     against_scene = np.array([claim.against == SCENE for claim in prover.claims], bool)
     targets = np.where(against_scene, least.get(SCENE, 0.0), least[""]) + ROUNDING_RESERVE
-    plane_finder = None if isinstance(prover, MovingProver) else PlaneFinder(prover)
+    moving = isinstance(prover, MovingProver)
+    hulls = {} if moving else {link: list(map(_hull, parts)) for link, parts in prover.parts.items()}
     proofs = list[StretchProof]()
     total = 0
     while len(todo.claim) or not proofs:  # once, even without claims
@@ -344,10 +330,10 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
             & (clearance < PLANES_BELOW)
             & (displacement < PLANES_DISPLACEMENT)
         )
-        if plane_finder is not None and close.any():
+        if hulls and close.any():
             rows = np.flatnonzero(close)
             near = todo.some(rows)
-            planes = plane_finder.planes(near, displacement[rows] + target[rows])
+            planes = [*_planes(prover, hulls, near, displacement[rows] + target[rows])]
             tighter = prover.bounds(near, np.ones(len(rows), bool), planes)
             plane_clearance = _down(tighter.clearance)
             plane_displacement = _up(tighter.displacement)

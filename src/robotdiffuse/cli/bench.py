@@ -99,11 +99,11 @@ def _write_replays(motions: list[Replay], file: Path) -> None:
 
 def run_confirm(arguments: Namespace) -> int:
     with progress("checking problems") as update:
-        confirmation = confirm(Path(arguments.folder), arguments.count, update)
-    refuted = [record.planner for record, _ in confirmation.refuted]
-    rows = [(planner, checked, refuted.count(planner)) for planner, checked in confirmation.checked.items()]
+        checked, contacts = confirm(Path(arguments.folder), arguments.count, update)
+    refuted = [record.planner for record, _ in contacts]
+    rows = [(planner, motions, refuted.count(planner)) for planner, motions in checked.items()]
     show(Table.of("", ("planner", "motions", "in collision (PyBullet)"), rows))
-    for record, contact in confirmation.refuted:
+    for record, contact in contacts:
         print(
             f"{record.planner}, {record.problem_set} {record.name}, seed {record.seed}: {contact.link} and "
             f"{contact.other}, {-1000 * contact.distance:.1f} mm deep"

@@ -84,26 +84,19 @@ def _packed_gradients(robot, empty, floors, floor, kinds, params, q, limit, marg
     return out, gradients
 
 
-def packed_link_clearances(
-    robot: RobotArrays, scenes: PackedScenes, q: Float32[ndarray, "batch waypoints dof"], limit: float
-) -> Float32[ndarray, "batch waypoints links"]:
-    """Signed distances of the moving links to the obstacles and floor of the scene with the same batch index
-    [m], at most `limit`.
-
-    `robot` comes from `compile_robot`.
-    """
-    return packed_clearances_and_gradients(robot, scenes, q, limit, -np.inf)[0]
-
-
 def packed_clearances_and_gradients(
     robot: RobotArrays,
     scenes: PackedScenes,
     q: Float32[ndarray, "batch waypoints dof"],
     limit: float,
-    margin: float,
+    margin: float = -np.inf,
 ) -> tuple[Float32[ndarray, "batch waypoints links"], Float32[ndarray, "batch waypoints dof"]]:
-    """`packed_link_clearances`, and the gradients that `CollisionChecker.clearances_and_gradients` returns
-    [m/rad]."""
+    """Signed distances of the moving links to the obstacles and floor of the scene with the same batch index
+    [m], at most `limit`; and the gradients that `CollisionChecker.clearances_and_gradients` returns [m/rad],
+    0 with the default margin.
+
+    `robot` comes from `compile_robot`.
+    """
     return _packed_gradients(robot, *_arrays(scenes), q, np.float32(limit), np.float32(margin))
 
 

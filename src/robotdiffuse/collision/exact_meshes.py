@@ -15,7 +15,7 @@ touching the surface.
 
 from collections.abc import Callable
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import coal
 import numpy as np
@@ -152,10 +152,6 @@ def _body(robot: Robot, link: str) -> _Body:
     return _Body(robot.link_frame(link), coal_surface(vertices, faces), vertices[faces], component, points)
 
 
-CHUNK_SIZE = 8192
-"""Number of configurations that `collides` processes at once, which limits its memory."""
-CLEAR_DISTANCE = 1e-6
-"""`collides` does not compute distances beyond this [m]."""
 RESTING_DEPTH = 0.01
 """If a held object penetrates an obstacle less deeply, the message says how to allow the contact [m]."""
 MAX_CONTACTS = 200
@@ -180,6 +176,11 @@ class _Piece(NamedTuple):
     T_frame_piece: Pose | None
     """None if the geometry is given in the frame already."""
 
+    def pose(self, frames: ndarray) -> coal.Transform3s:
+        """Its pose in the base frame, as Coal takes it."""
+        T = frames[self.frame]
+        return coal_pose(T if self.T_frame_piece is None else T @ self.T_frame_piece)
+
 
 TREE_SECONDS_PER_ELEMENT = 4e-6
 """Approximate time in which Coal adds one point or triangle to its bounding volume tree [s]."""
@@ -197,22 +198,11 @@ class _Obstacle(NamedTuple):
     """The radius of each point of a point cloud [m]."""
 
 
-def _places(frames: ndarray, *bodies: _Piece | _Obstacle) -> list[Any]:
-    """The geometry and the pose of each body, as Coal takes them."""
-    places = []
-    for body in bodies:
-        if isinstance(body, _Obstacle):
-            pose = body.T
-        else:
-            T = frames[body.frame]
-            pose = coal_pose(T if body.T_frame_piece is None else T @ body.T_frame_piece)
-        places += [body.geometry, pose]
-    return places
-
-
-def forward_frames(robot: Robot, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n frames 4 4"]:
-    """T_base_frame of frames 0 to dof, in float64 and independent of the PyTorch kinematics."""
-    return kernel.forward(*robot.kernel_joints, for_kernels(q))
+def forward_frames(robot: Robot, q: Float[ndarray, "*batch dof"]) -> Float[ndarray, "*batch frames 4 4"]:
+    """T_base_frame of frames 0 to dof at each configuration, in float64 and independent of the PyTorch
+    kinematics."""
+    T = kernel.forward(*robot.kernel_joints, for_kernels(q.reshape(-1, robot.dof)))
+    return T.reshape(*q.shape[:-1], *T.shape[1:])
 
 
 def _piece(part: Part) -> _Piece:
@@ -297,13 +287,11 @@ class ExactCollision:
         self.robot, self._solids = robot, solid_arrays(robot, scene)
         self._pieces, self._obstacles = _pieces(robot), _obstacles(scene)
         self.checks = checks_of(robot)
-        self._scene_checks = sum(check.other is None for check in self.checks)
         self._request = coal.DistanceRequest()
         self._request.enable_signed_distance = True
         self._first_contact, self._contacts = coal.CollisionRequest(), coal.CollisionRequest()
         self._first_contact.enable_contact = self._contacts.enable_contact = True
         self._contacts.num_max_contacts = MAX_CONTACTS
-        self._collide = coal.CollisionRequest()
 
     @cached_property
     def _candidates(self) -> tuple[_Candidates, ...]:
@@ -334,7 +322,8 @@ class ExactCollision:
 
         Without `depth`, the penetration of a surface may be too small, but the sign is right.
         """
-        places = _places(frames, piece, other)
+        other_pose = other.pose(frames) if isinstance(other, _Piece) else other.T
+        places = piece.geometry, piece.pose(frames), other.geometry, other_pose
         result = coal.DistanceResult()
         if isinstance(other, _Piece) or not other.surface:
             return coal.distance(*places, self._request, result)
@@ -368,110 +357,72 @@ class ExactCollision:
         frames = forward_frames(self.robot, q)
         distances = np.full(len(q), np.nan)
         names: list[str | None] = [None] * len(q)
-        depth = stop == -np.inf  # of a distance at which the search stops, only the sign matters
         for i, (check, cutoff) in enumerate(zip(checks.tolist(), cutoffs.tolist(), strict=True)):
-            candidates = self._candidates[check]
-            obstacle = None
-            if candidates.surfaces is None:
-                distances[i], obstacle = self._closest(candidates, frames[i], cutoff, stop, depth)
-            else:
-                distances[i] = self._grazing_distance(candidates, frames[i], cutoff, depth)
+            distances[i], obstacle = self._distance(self._candidates[check], frames[i], cutoff, stop)
             if distances[i] < cutoff:
                 names[i] = self.checks[check].other or obstacle
             if distances[i] <= stop:
                 break
         return distances, names
 
-    def _closest(
-        self, candidates: _Candidates, frames: ndarray, cutoff: float, stop: float, depth: bool
+    def _distance(
+        self, candidates: _Candidates, frames: ndarray, cutoff: float, stop: float
     ) -> tuple[float, str | None]:
-        """Smallest signed distance of a check's pairs of geometries [m], at most `cutoff`, and the name of
-        the nearest obstacle, None for two links. The search ends at the first distance of at most `stop`.
-        Without `depth`, the penetration of a surface may be too small, but the sign is right."""
+        """Signed distance of a check [m], at most `cutoff`, and the name of the nearest obstacle, None for
+        two links. The search ends at the first distance of at most `stop`. Unless `stop` is -inf, the
+        penetration of a surface may be too small, but the sign is right.
+
+        The distance is the smallest of all pairs of geometries. For two grazing links, it is the distance of
+        their mesh surfaces if that is larger. The surfaces count only if the signed distance of the convex
+        parts is between -MAX_OVERLAP and SURFACES_BELOW, and if the surfaces neither touch nor enclose a
+        component of each other.
+        """
+        surfaces = candidates.surfaces
+        enough = stop if surfaces is None else min(stop, -MAX_OVERLAP)
         best = cutoff
         obstacle = None
         lower = candidates.lower(frames[None])[0]
         for candidate in lower.argsort().tolist():
-            if lower[candidate] >= best or best <= stop:
+            if lower[candidate] >= best or best <= enough:
                 break
             piece, partner = candidates.pair(candidate)
-            distance = self._signed(piece, partner, frames, best, depth)
+            distance = self._signed(piece, partner, frames, best, depth=stop == -np.inf)
             if distance < best:
                 best = distance
                 obstacle = partner.name if isinstance(partner, _Obstacle) else None
+        if surfaces is not None and -MAX_OVERLAP < best < SURFACES_BELOW:
+            surface_distance = surfaces.distance(frames, cutoff)
+            best = best if surface_distance is None else min(max(best, surface_distance), cutoff)
         return best, obstacle
 
-    def _grazing_distance(
-        self, candidates: _Candidates, frames: ndarray, cutoff: float, depth: bool
-    ) -> float:
-        """Signed distance of two grazing links [m], at most `cutoff`.
-
-        It is the distance of their convex parts, or the distance of their mesh surfaces if that is larger.
-        The surfaces count only if the signed distance of the parts is between -MAX_OVERLAP and
-        SURFACES_BELOW, and if the surfaces neither touch nor enclose a component of each other. Without
-        `depth`, the penetration may be too small, but the sign is right.
-        """
-        assert candidates.surfaces is not None
-        best, _ = self._closest(candidates, frames, cutoff, -np.inf if depth else -MAX_OVERLAP, depth)
-        if not -MAX_OVERLAP < best < SURFACES_BELOW:
-            return best
-        surface_distance = candidates.surfaces.distance(frames, cutoff)
-        return best if surface_distance is None else min(max(best, surface_distance), cutoff)
-
-    def link_distances(self, q: Configuration) -> tuple[Distance, ...]:
-        """Signed distance of every moving link to the nearest obstacle [m], infinite in an empty scene."""
-        return self._all(q, range(self._scene_checks))
-
-    def pair_distances(self, q: Configuration) -> tuple[Distance, ...]:
-        """Signed distance of every checked pair of links [m], negative where they overlap."""
-        return self._all(q, range(self._scene_checks, len(self.checks)))
+    def distances(self, q: Configuration) -> tuple[Distance, ...]:
+        """Signed distances [m]: of every moving link to the nearest obstacle, infinite in an empty scene;
+        then of every checked pair of links, negative where they overlap."""
+        count = len(self.checks)
+        distances, names = self.nearest(np.tile(q, (count, 1)), np.arange(count), np.full(count, np.inf))
+        return tuple(
+            Distance(check.link, name, distance)
+            for check, name, distance in zip(self.checks, names, distances.tolist(), strict=True)
+        )
 
     def distance_from_moved_base(self, link: str, q: Configuration, T: Pose) -> float:
         """Signed distance of a link to the nearest obstacle [m] after the whole robot, base included, is
         moved by T. This equals the distance to obstacles that are moved by the inverse of T."""
-        frames = T @ forward_frames(self.robot, q[None])[0]
+        frames = T @ forward_frames(self.robot, q)
         return min(
             self._signed(piece, obstacle, frames, np.inf, depth=True)
             for piece in self._pieces[link]
             for obstacle in self._obstacles
         )
 
-    def _all(self, q: ndarray, checks: range) -> tuple[Distance, ...]:
-        rows = np.tile(q, (len(checks), 1))
-        distances, names = self.nearest(rows, np.array(checks, dtype=np.int64), np.full(len(checks), np.inf))
-        return tuple(
-            Distance(self.checks[check].link, name, distance)
-            for check, name, distance in zip(checks, names, distances.tolist(), strict=True)
-        )
-
     def collides(self, q: Float[ndarray, "n dof"]) -> Bool[ndarray, "n"]:
         """Whether each configuration touches the scene or itself."""
-        return np.concatenate(
-            [np.zeros(0, bool), *(self._chunk(q[i : i + CHUNK_SIZE]) for i in range(0, len(q), CHUNK_SIZE))]
-        )
-
-    def _chunk(self, q: ndarray) -> ndarray:
         frames = forward_frames(self.robot, q)
         hit = np.zeros(len(q), bool)
-        result = coal.CollisionResult()
         for candidates in self._candidates:
-            undecided = np.flatnonzero(~hit)
-            rows, columns = np.nonzero(candidates.lower(frames[undecided]) <= 0)
-            separated = np.zeros(len(q), bool)  # grazing links with overlapping parts and separate surfaces
-            for row, column in zip(undecided[rows].tolist(), columns.tolist(), strict=True):
-                if hit[row] or separated[row]:
-                    continue
-                piece, partner = candidates.pair(column)
-                if isinstance(partner, _Obstacle) and partner.inflation > 0:
-                    hit[row] = self._signed(piece, partner, frames[row], CLEAR_DISTANCE, depth=False) <= 0
-                    continue
-                result.clear()
-                coal.collide(*_places(frames[row], piece, partner), self._collide, result)
-                hit[row] = result.isCollision()
-                if hit[row] and candidates.surfaces is not None:
-                    distance = self._grazing_distance(candidates, frames[row], CLEAR_DISTANCE, depth=False)
-                    separated[row] = distance > 0
-                    hit[row] = not separated[row]
+            near = (candidates.lower(frames) <= 0).any(axis=1)
+            for row in np.flatnonzero(near & ~hit):
+                hit[row] = self._distance(candidates, frames[row], SURFACES_BELOW, 0.0)[0] <= 0
         return hit
 
 
@@ -484,8 +435,7 @@ def warm_up(robot: Robot) -> None:
 
 def contacts_at(robot: Robot, scene: Scene, q: Configuration) -> list[Distance]:
     """The links that touch an obstacle or another link at a configuration, the deepest contact first."""
-    exact = ExactCollision(robot, scene)
-    checks = (*exact.link_distances(q), *exact.pair_distances(q))
+    checks = ExactCollision(robot, scene).distances(q)
     return sorted((check for check in checks if check.distance <= 0), key=lambda check: check.distance)
 
 

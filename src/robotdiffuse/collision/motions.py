@@ -336,24 +336,25 @@ def _follow(
     arm is free again. Returns the travel at which the arm is free, or the end of the motion."""
     open_contacts = {(first.check, first.other): len(contact_list)}
     contact_list.append(first._replace(at=_place(motion, at)))
-    count = len(exact.checks)
     begin = at
     end = float(motion.travel[-1])
     while True:
-        q = motion_pieces.configurations(motion, np.full(count, at))
-        distances, names = exact.nearest(q, np.arange(count), np.full(count, np.inf))
-        touching = {(exact.checks[i], str(names[i])): i for i in np.flatnonzero(distances <= contact)}
+        [q] = motion_pieces.configurations(motion, np.array([at]))
+        depths = {
+            (check, str(found.other)): max(0.0, -found.distance)
+            for check, found in zip(exact.checks, exact.distances(q), strict=True)
+            if found.distance <= contact
+        }
         if at > begin:
-            open_contacts = {key: k for key, k in open_contacts.items() if key in touching}
-        for key, i in touching.items():
-            depth = max(0.0, -float(distances[i]))
+            open_contacts = {key: k for key, k in open_contacts.items() if key in depths}
+        for key, depth in depths.items():
             if key in open_contacts:
                 k = open_contacts[key]
                 contact_list[k] = contact_list[k]._replace(depth=max(contact_list[k].depth, depth))
             else:
                 open_contacts[key] = len(contact_list)
                 contact_list.append(Contact(*key, _place(motion, at), depth))
-        if at >= end or (at > begin and not touching):
+        if at >= end or (at > begin and not depths):
             return at
         at = min(at + DEPTH_SAMPLE_TRAVEL, end)
 

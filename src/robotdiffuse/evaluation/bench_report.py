@@ -4,7 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy import ndarray
@@ -40,9 +40,6 @@ from robotdiffuse.evaluation.runs import (
 from robotdiffuse.planning import PLANNERS, SEARCH
 from robotdiffuse.problems.files import Case
 from robotdiffuse.problems.problem import JointGoal
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as PlotFigure
 
 UNEQUAL = " †"
 UNEQUAL_NOTE = (
@@ -253,7 +250,7 @@ def _over_time(
     same color as without."""
     names = list(dict.fromkeys(map(plain_name, planners)))
 
-    def fill(figure: "PlotFigure") -> None:
+    def fill(figure: Any) -> None:
         axes = figure.subplots()
         for curve in curves:
             entry = PLANNERS.get(base_name(curve.planner))

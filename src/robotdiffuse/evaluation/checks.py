@@ -326,22 +326,19 @@ CONFIRM_STEP = 0.02
 """Largest distance between successive checked configurations [rad, joint-space L2]."""
 
 
-@dataclass(frozen=True)
-class Confirmation:
-    checked: dict[str, int]
-    """Number of checked motions by planner."""
-    refuted: "list[tuple[Record, OracleContact]]"
-    """Records of motions that planners returned as solved but that collide according to PyBullet, each with
-    the first contact."""
-
-
-def confirm(out: FilePath, count: int | None, progress: Done) -> Confirmation:
+def confirm(
+    out: FilePath, count: int | None, progress: Done
+) -> "tuple[dict[str, int], list[tuple[Record, OracleContact]]]":
     """Check the returned motions in a folder of `bench run` with PyBullet.
 
     Args:
         out: The folder.
         count: Number of problems of each set to check, from the first on; None: all.
         progress: Called with the number of checked problems and the total number.
+
+    Returns:
+        The number of checked motions by planner; and the records of motions that planners returned as solved
+        but that collide according to PyBullet, each with the first contact.
 
     Raises:
         InputError: If the folder has no records or is damaged, or PyBullet is not installed.
@@ -365,7 +362,7 @@ def confirm(out: FilePath, count: int | None, progress: Done) -> Confirmation:
         if case.key in solved and not case.problem.moving  # records keep no times
     ]
     checked = {record.planner: 0 for record in records}
-    refuted: list[tuple[Record, OracleContact]] = []
+    refuted = []
     for number, case in enumerate(chosen, start=1):
         robot = case.problem.robot
         with PyBulletOracle(robot, case.problem.scene) as validator:
@@ -375,4 +372,4 @@ def confirm(out: FilePath, count: int | None, progress: Done) -> Confirmation:
                 if contact is not None:
                     refuted.append((record, contact))
         progress(number, len(chosen))
-    return Confirmation(checked, refuted)
+    return checked, refuted

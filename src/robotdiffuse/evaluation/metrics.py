@@ -57,8 +57,7 @@ def link_length(robot: Robot, q: Float[ndarray, "n waypoints dof"]) -> Values:
     Links that are fixed to these links, such as the hand, are left out, since they would count the last link
     several times. The paper's arm has no hand.
     """
-    at = forward_frames(robot, q.reshape(-1, q.shape[-1]))[:, 1:, :3, 3]
-    at = at.reshape(*q.shape[:2], *at.shape[1:])
+    at = forward_frames(robot, q)[..., 1:, :3, 3]
     return np.linalg.norm(np.diff(at, axis=1), axis=-1).sum(axis=(1, 2))
 
 

@@ -11,7 +11,7 @@ import timeit
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy import ndarray
@@ -57,9 +57,6 @@ from robotdiffuse.problems.families.rop import ROP, Rop
 from robotdiffuse.problems.files import SEED, Case, CaseFile, Progress, goal_of
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as PlotFigure
 
 
 def paper_report(title: str, command: str) -> Report:
@@ -570,7 +567,7 @@ def success_by_steps(out: FilePath, count: int) -> RecordsBySteps:
 def plot_success_by_steps(records: RecordsBySteps) -> str:
     """Plot of the share of single samples that pass the validator over the number of denoising steps; SVG."""
 
-    def fill(figure: "PlotFigure") -> None:
+    def fill(figure: Any) -> None:
         axes = figure.subplots()
         for name, by_steps in records.items():
             shares = [np.array([r.passed for r in values]) for values in by_steps.values()]

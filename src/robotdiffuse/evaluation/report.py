@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy import ndarray
@@ -18,9 +18,6 @@ from numpy import ndarray
 from robotdiffuse.core.errors import needs
 from robotdiffuse.core.files import write_atomically
 from robotdiffuse.core.tables import Figure, Table, markdown, plain
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Plot
 
 STYLE = """
 body { max-width: 1320px; margin: 0 auto; padding: 24px; color: #222b38; background: white;
@@ -153,9 +150,9 @@ Histograms = dict[str, tuple[ndarray, Mapping[str, ndarray]]]
 """For each panel, by its label: the edges of the bins, and the values of each line by name."""
 
 
-def draw_plot(fill: "Callable[[Plot], object]", width: float = 6.25, height: float = 3.7) -> str:
-    """Lets `fill` draw on a figure of about this size [inch], and returns its SVG element. Raises InputError
-    if matplotlib is not installed."""
+def draw_plot(fill: Callable[[Any], object], width: float = 6.25, height: float = 3.7) -> str:
+    """Lets `fill` draw on matplotlib's figure of about this size [inch], and returns its SVG element. Raises
+    InputError if matplotlib is not installed."""
     with needs("matplotlib", "data"):
         import matplotlib
         from matplotlib.figure import Figure as Plot
@@ -174,7 +171,7 @@ def histograms(panels: Histograms, across: int) -> str:
     the first panel."""
     down = -(-len(panels) // across)
 
-    def fill(figure: "Plot") -> None:
+    def fill(figure: Any) -> None:
         grid = figure.subplots(down, across, squeeze=False)
         for axes in grid.flat[len(panels) :]:
             axes.set_axis_off()

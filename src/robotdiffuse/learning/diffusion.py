@@ -23,7 +23,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry, Registry
-from robotdiffuse.core.settings import Bound, NotNegative, Settings
+from robotdiffuse.core.settings import Bound, NotNegative, Settings, ShareBetween
 from robotdiffuse.core.types import Values
 
 
@@ -35,7 +35,7 @@ class ScheduleSettings(Settings, name="schedule"):
     """T, the number of noise levels (paper: 200)."""
     offset: NotNegative = 0.008
     """The equation's s, which makes the noise of the first levels large enough."""
-    floor: Annotated[float, Bound(above=0.0, below=1.0)] = 1e-4
+    floor: ShareBetween = 1e-4
     """Smallest alpha_bar, which is the fraction of the variance that is still signal at the last level."""
     log_snr_shift: NotNegative = 0.0
     """Subtracted from the logarithm of every level's signal-to-noise ratio (Hoogeboom et al. 2023). White
@@ -113,8 +113,10 @@ Array = TypeVar("Array", bound=Any)
 [..., waypoints, dof]."""
 
 
+@dataclass(frozen=True)
 class Objective:
-    """What the network is trained to predict: the clean trajectory x_0 itself (paper, Method).
+    """What the network is trained to predict: the clean trajectory x_0 itself (paper, Method), or the noise n
+    (Ho et al. 2020).
 
     Each objective is a linear function of the clean trajectory and the noise. So the clean trajectory can be
     computed from x_t and the output for it, and samplers work on clean trajectories only. The formulas are
@@ -122,17 +124,19 @@ class Objective:
     values at the levels of the trajectories, and broadcast against the trajectories.
     """
 
-    def target(self, clean: Array, noise: Array, signal: Any, noise_level: Any) -> Array:
+    predicts_noise: bool
+
+    def target(self, clean: Array, noise: Array) -> Array:
         """The output that the network should have for x_t = signal * clean + noise_level * noise."""
-        return clean
+        return noise if self.predicts_noise else clean
 
     def clean(self, x_t: Array, output: Array, signal: Any, noise_level: Any) -> Array:
         """The clean trajectory that follows from an output of the network for x_t."""
-        return output
+        return (x_t - noise_level * output) / signal if self.predicts_noise else output
 
     def clean_per_output(self, signal: Any, noise_level: Any) -> Any:
         """d clean / d output: factor from an error of the output to the error of the clean trajectory."""
-        return 0 * signal + 1
+        return -noise_level / signal if self.predicts_noise else 0 * signal + 1
 
     def weight(self, schedule: NoiseSchedule, t: Int[ndarray, "n"], limit: float | None) -> Values:
         """Weight of the squared error of the output at levels t >= 1, at most `limit`; None: 1 everywhere.
@@ -148,21 +152,8 @@ class Objective:
         return np.minimum(schedule.weight(t, limit) * scale**2, limit)
 
 
-class NoiseObjective(Objective):
-    """Predicts the noise n (Ho et al. 2020)."""
-
-    def target(self, clean: Array, noise: Array, signal: Any, noise_level: Any) -> Array:
-        return noise
-
-    def clean(self, x_t: Array, output: Array, signal: Any, noise_level: Any) -> Array:
-        return (x_t - noise_level * output) / signal
-
-    def clean_per_output(self, signal: Any, noise_level: Any) -> Any:
-        return -noise_level / signal
-
-
-OBJECTIVES = {"clean": Objective(), "noise": NoiseObjective()}
-"""Objectives by their name in settings. A new objective is a class and an entry here."""
+OBJECTIVES = {"clean": Objective(predicts_noise=False), "noise": Objective(predicts_noise=True)}
+"""Objectives by their name in settings."""
 
 Samples = Float[ndarray, "count ..."]
 NoiseLevels = Int[ndarray, "steps"]

@@ -22,7 +22,6 @@ radian counts as `projection_kernel.ANGLE_WEIGHT` meters.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -33,7 +32,6 @@ from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP, cost_gr
 from robotdiffuse.collision.kernels.lane_clearance import make_clearance_workspace, pair_clearances_into
 from robotdiffuse.core.kernels import ONE, ZERO, allocation_free, inner_kernel, kernel
 from robotdiffuse.core.settings import NotNegative, Positive, Settings, Share
-from robotdiffuse.core.types import Values
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.constraint_kernel import make_work
 from robotdiffuse.problems.projection_kernel import step
@@ -42,29 +40,17 @@ OFF = -CLEARANCE_CAP
 """The margin of a cost that is not enabled: no distance is ever below it."""
 
 
-class Steps(NamedTuple):
-    """Parameters of one round of steps: `GuidanceSettings` in the types that compiled code takes."""
-
-    margin: np.float32
-    """Margin to obstacles [m], or OFF."""
-    self_margin: np.float32
-    """Margin between links [m], or OFF."""
-    push: np.float32
-    """Longest push of a waypoint [rad]."""
-    spread_weights: Float[ndarray, "waypoints waypoints"]
-    """Weights by which pushes spread over neighboring waypoints."""
-    length: np.float32
-    """Fraction of the way to the middle of its neighbors by which a waypoint moves."""
-
-
 @kernel(nogil=True)
-def descend(robot, scene, q, lower, upper, steps, rounds):
+def descend(robot, scene, q, lower, upper, margin, self_margin, push, spread_weights, length, rounds):
     """Moves the waypoints of trajectories q [batch, waypoints, dof], in place, except the first and the last.
-    Returns the margin costs [batch] of the waypoints at the beginning of the last round.
 
     In each of the `rounds`, each waypoint within a margin is pushed out of it, the pushes are spread over the
     neighboring waypoints, and then a step shortens the trajectory. If margins are enabled, a trajectory
     without a waypoint within a margin is not changed.
+
+    margin: to obstacles, self_margin: between links [m], or OFF. push: longest push of a waypoint [rad].
+    spread_weights [waypoints, waypoints]: weights by which pushes spread over neighboring waypoints. length:
+    fraction of the way to the middle of its neighbors by which a waypoint moves.
     """
     batch, n, dof = q.shape
     first = 1
@@ -73,28 +59,25 @@ def descend(robot, scene, q, lower, upper, steps, rounds):
     pushes = np.empty((n, dof), np.float32)
     active = np.empty(n, np.float32)
     gradient = np.empty(dof, np.float32)
-    costs = np.zeros(batch, np.float32)
     work = make_clearance_workspace(robot, 1)
     pairs = np.full((n, len(robot.pairs)), CLEARANCE_CAP)
-    pushed = max(steps.margin, steps.self_margin) > OFF
+    pushed = max(margin, self_margin) > OFF
     for b in range(batch):
         for _ in range(rounds):
             total = ZERO
-            if steps.self_margin > OFF:
-                pair_clearances_into(robot, q[b], steps.self_margin, work, pairs)
+            if self_margin > OFF:
+                pair_clearances_into(robot, q[b], self_margin, work, pairs)
             for i in range(first, last):
                 gradient[:] = ZERO
                 cost = cost_gradient_at(
-                    robot, scene, q[b, i], pairs[i], steps.margin, steps.self_margin, scratch, gradient
+                    robot, scene, q[b, i], pairs[i], margin, self_margin, scratch, gradient
                 )
                 total += cost
-                active[i] = _push_away(cost, gradient, steps.push, pushes[i])
-            costs[b] = total
+                active[i] = _push_away(cost, gradient, push, pushes[i])
             if pushed and total <= ZERO:
                 break
-            _spread(q[b], first, last, pushes, active, steps.spread_weights, lower, upper)
-            _shorten(q[b], first, last, steps.length)
-    return costs
+            _spread(q[b], first, last, pushes, active, spread_weights, lower, upper)
+            _shorten(q[b], first, last, length)
 
 
 @inner_kernel()
@@ -189,12 +172,11 @@ class CollisionGuidance:
         if constraints is not None:
             self._constraints = constraints.rows, constraints.limits(tolerance_share)
 
-    def __call__(self, q: Trajectories, steps: int) -> tuple[Trajectories, Values]:
-        """The trajectories [rad] after `steps` steps, and their margin costs before the last step.
+    def __call__(self, q: Trajectories, steps: int) -> Trajectories:
+        """The trajectories [rad] after `steps` steps.
 
-        The first and the last waypoint are not moved and have no cost. If margins are enabled, a trajectory
-        with no other waypoint within a margin has zero cost, and neither pushes nor the cost of length
-        change it. Path constraints still do.
+        The first and the last waypoint are not moved. If margins are enabled, neither pushes nor the cost of
+        length change a trajectory with no other waypoint within a margin. Path constraints still do.
         """
         settings = self.settings
         checker = self.checker
@@ -202,23 +184,19 @@ class CollisionGuidance:
         spread = np.exp(-0.5 * ((index[:, None] - index) / settings.width) ** 2).astype(np.float32)
         moved = np.array(q, np.float32)
         lower, upper = (limits.astype(np.float32) for limits in (checker.robot.lower, checker.robot.upper))
-        compiled = Steps(
-            margin=OFF if settings.margin is None else np.float32(settings.margin),
-            self_margin=OFF if settings.self_margin is None else np.float32(settings.self_margin),
-            push=np.float32(settings.push),
-            spread_weights=spread,
-            length=np.float32(settings.length),
+        margin, self_margin = (
+            OFF if limit is None else np.float32(limit) for limit in (settings.margin, settings.self_margin)
         )
-        costs = np.zeros(len(q), np.float32)
+        push, length = np.float32(settings.push), np.float32(settings.length)
         # one call for all rounds, or one call for each if steps towards the constraints follow each round
         for rounds in [steps] if self._constraints is None else [1] * steps:
             arrays = checker.robot_arrays, checker.scene_arrays
-            costs = descend(*arrays, moved, lower, upper, compiled, rounds)
+            descend(*arrays, moved, lower, upper, margin, self_margin, push, spread, length, rounds)
             if self._constraints is not None:
                 projected = moved.astype(np.float64)
                 _towards_constraints(*self._constraints, projected.reshape(-1, q.shape[2]), settings.push)
                 moved[:, 1:-1] = np.clip(projected.astype(np.float32)[:, 1:-1], lower, upper)
-        return moved, costs
+        return moved
 
 
 @kernel(nogil=True)

@@ -16,7 +16,7 @@ from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients, packed_link_clearances
+from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Bound, Count, OneOf, Settings, SettingsOf, Share
@@ -504,6 +504,6 @@ def packed_clearances(robot: Robot, settings: MotionModelSettings) -> PackedClea
         arguments = arrays, scenes, q, MAX_CLEARANCE
         if settings.clearance_gradients:
             return np.concatenate(packed_clearances_and_gradients(*arguments, GRADIENT_MARGIN), axis=-1)
-        return packed_link_clearances(*arguments)
+        return packed_clearances_and_gradients(*arguments)[0]
 
     return clearances

@@ -224,11 +224,9 @@ NEAR_SHARE = 0.05
 
 def wide_regions(mask: Bool[ndarray, "*n"], width: int) -> Bool[ndarray, "*n"]:
     """The parts of a mask that are at least `width` wide along every axis: its morphological opening."""
-    from scipy.ndimage import maximum_filter, minimum_filter
+    from scipy.ndimage import grey_opening
 
-    eroded = minimum_filter(mask.view(np.uint8), width, mode="nearest")
-    origin = width % 2 - 1  # windows of an even width are not symmetric
-    return maximum_filter(eroded, width, mode="nearest", origin=origin).view(np.bool_)
+    return grey_opening(mask.view(np.uint8), width, mode="nearest").view(np.bool_)
 
 
 def empty_regions(depth: DepthImage, reach: float | None = None, arm: Pixels | None = None) -> Pixels | None:

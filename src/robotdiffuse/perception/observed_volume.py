@@ -70,28 +70,24 @@ def usable_depth(depth, focal):
     """The depths, with MAX_DEPTH for rays without an obstacle, and NO_RETURN for missing returns and flying
     pixels. Negative depths are not changed."""
     h, w = depth.shape
-    out = np.empty((h, w), np.float32)
+    returns = np.empty((h, w), np.float32)
     for v in range(h):
         for u in range(w):
             d = depth[v, u]
-            out[v, u] = min(d, MAX_DEPTH) if d >= _NEAREST else (d if d < ZERO else NO_RETURN)
-    flying = np.zeros((h, w), np.bool_)
+            returns[v, u] = min(d, MAX_DEPTH) if d >= _NEAREST else (d if d < ZERO else NO_RETURN)
+    out = returns.copy()
     for v in range(1, h - 1):
         for u in range(1, w - 1):
-            d = out[v, u]
+            d = returns[v, u]
             step = max(FLYING_PIXEL_STEP, FLYING_PIXEL_WIDTHS * d / focal)
             # the left, right, upper and lower neighbor
-            a = out[v, u - 1]
-            b = out[v, u + 1]
-            c = out[v - 1, u]
-            e = out[v + 1, u]
+            a = returns[v, u - 1]
+            b = returns[v, u + 1]
+            c = returns[v - 1, u]
+            e = returns[v + 1, u]
             across = (a > ZERO) & (b > ZERO) & (min(a, b) < d - step) & (max(a, b) > d + step)
             along = (c > ZERO) & (e > ZERO) & (min(c, e) < d - step) & (max(c, e) > d + step)
-            flying[v, u] = across | along
-    for v in range(h):
-        for u in range(w):
-            if flying[v, u]:
-                out[v, u] = NO_RETURN
+            out[v, u] = NO_RETURN if across | along else d
     return out
 
 
@@ -188,13 +184,11 @@ def minimum_table(min_depth, levels):
         step = 1 << (k - 1)
         before = table[k - 1]
         now = table[k]
-        for v in range(h):
-            a = before[v]
-            b = before[min(v + step, h - 1)]
-            for u in range(w - step):
-                now[v, u] = min(min(a[u], a[u + step]), min(b[u], b[u + step]))
-            for u in range(max(w - step, 0), w):
-                now[v, u] = min(a[u], b[u])
+        now[:] = before
+        rows = max(h - step, 0)
+        columns = max(w - step, 0)
+        now[:rows] = np.minimum(before[:rows], before[step:])
+        now[:, :columns] = np.minimum(now[:, :columns], now[:, step:])
     return table
 
 

@@ -172,22 +172,20 @@ def fill_voxels(solids, low, voxel, margin, out):
 
     low: lower corner of the grid. All arrays are float32, except `out`, bool.
     """
-    nx, ny, nz = out.shape
+    first = np.empty(3, np.int64)
+    end = np.empty(3, np.int64)
     for s in range(len(solids)):
         row = solids[s]
         reach = _radius(row) + margin
-        i0 = int(max((row[0] - reach - low[0]) / voxel, ZERO))
-        i1 = int((row[0] + reach - low[0]) / voxel + 1)
-        j0 = int(max((row[1] - reach - low[1]) / voxel, ZERO))
-        j1 = int((row[1] + reach - low[1]) / voxel + 1)
-        k0 = int(max((row[2] - reach - low[2]) / voxel, ZERO))
-        k1 = int((row[2] + reach - low[2]) / voxel + 1)
+        for axis in range(3):
+            first[axis] = int(max((row[axis] - reach - low[axis]) / voxel, ZERO))
+            end[axis] = min(int((row[axis] + reach - low[axis]) / voxel + 1), out.shape[axis])
         square = (margin + row[15]) ** 2
-        for i in range(i0, min(i1, nx)):
+        for i in range(first[0], end[0]):
             px = low[0] + (np.float32(i) + HALF) * voxel - row[0]
-            for j in range(j0, min(j1, ny)):
+            for j in range(first[1], end[1]):
                 py = low[1] + (np.float32(j) + HALF) * voxel - row[1]
-                for k in range(k0, min(k1, nz)):
+                for k in range(first[2], end[2]):
                     pz = low[2] + (np.float32(k) + HALF) * voxel - row[2]
                     # how far the center is outside the half edges, along each axis of the solid
                     x = abs(row[3] * px + row[4] * py + row[5] * pz)

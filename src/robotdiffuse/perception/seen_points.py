@@ -64,15 +64,15 @@ def _key(x, y, z, voxel):
 
 
 @kernel(nogil=True)
-def gather(points, reach, spheres, voxel, keys, row_of, sums, count):
+def gather(points, reach, spheres, box, voxel, keys, row_of, sums, count):
     """Adds points [3, n] to cells `voxel` wide. Returns the number of cells; -1 if `sums` is too small.
 
-    Points beyond `reach` of the origin, NaN, and points inside one of the spheres [n, 4] are left out. keys,
-    int64, and row_of, int32, are an open-addressing hash table from a cell's key to its row in `sums`; empty
-    slots have the key -1. sums [m, 4]: the sums of the coordinates and the number of points of each cell.
-    count: number of cells in use.
+    Points beyond `reach` of the origin, NaN, and points inside one of the spheres [n, 4] are left out. box:
+    lower and upper corner of a box around the spheres, in one array. keys, int64, and row_of, int32, are an
+    open-addressing hash table from a cell's key to its row in `sums`; empty slots have the key -1.
+    sums [m, 4]: the sums of the coordinates and the number of points of each cell. count: number of cells in
+    use.
     """
-    box = _box(spheres)
     columns = _columns(spheres)
     # a cache of the rows of recent cells, since most points are in the cell of a neighboring pixel
     recent = np.full(RECENT, -1, np.int64)
@@ -165,19 +165,6 @@ def supported(keys, row_of, sums, count, least):
                         is_supported = keys[near] != -1 and sums[row_of[near], 3] >= least
         out[row_of[at]] = is_supported
     return out
-
-
-@kernel(nogil=True)
-def _box(spheres):
-    """Lower and upper corner of a box around spheres, in one array."""
-    box = np.zeros(6, np.float32)
-    for axis in range(3):
-        for s in range(len(spheres)):
-            low = spheres[s, axis] - spheres[s, 3]
-            high = spheres[s, axis] + spheres[s, 3]
-            box[axis] = low if s == 0 else min(box[axis], low)
-            box[3 + axis] = high if s == 0 else max(box[3 + axis], high)
-    return box
 
 
 @kernel(nogil=True)
@@ -275,7 +262,10 @@ def seen_points(views: Sequence[DepthView], robot: Robot, start: Configuration) 
                 intrinsics = tuple(map(np.float32, view.intrinsics))
                 points = image_points(filtered(view).depth, intrinsics, view.T_base_camera.astype(np.float32))
             reach = np.float32(reach_bound(robot) + REACH_MARGIN)
-            count = gather(points, reach, spheres, np.float32(CELL), keys, row_of, sums, count)
+            low = (spheres[:, :3] - spheres[:, 3:]).min(axis=0, initial=np.inf)
+            high = (spheres[:, :3] + spheres[:, 3:]).max(axis=0, initial=-np.inf)
+            box = np.concatenate([low, high])
+            count = gather(points, reach, spheres, box, np.float32(CELL), keys, row_of, sums, count)
             if count < 0:
                 break
         if count >= 0:

@@ -213,7 +213,7 @@ BALL_RADIUS = BALL_CELL * 3**0.5 / 2 + SAMPLE_DISTANCE
 def surface_balls(robot: Robot, q: Configuration) -> Points:
     """Centers of balls of BALL_RADIUS that cover the surfaces of the moving links and of the objects that
     they hold, at a configuration, in the base frame [m]."""
-    frames = forward_frames(robot, q[None])[0]
+    frames = forward_frames(robot, q)
     return np.concatenate(list(map(placed, frames, _balls_by_frame(robot)))).astype(np.float32)
 
 

@@ -101,7 +101,7 @@ class Diffusion(ExportedPlanner[DiffusionSettings]):
         clearances = clearances or link_clearances(checker, model.settings)
 
         def guide(q: ndarray, _level: float) -> ndarray:
-            return guidance(q, settings.guidance_steps)[0]
+            return guidance(q, settings.guidance_steps)
 
         parts = [
             model.sample(

@@ -17,7 +17,7 @@ from robotdiffuse.collision.kernels.motions import path_length
 from robotdiffuse.core.transforms import rotation_about
 from robotdiffuse.core.types import Configuration, Configurations, PlanResult, Pose, Poses, Status
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.problems.compiled_constraints import line_end, rotation_vector
+from robotdiffuse.problems.compiled_constraints import line_end, pose_difference
 from robotdiffuse.problems.constraints import CartesianLine
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots.ik_kernel import IKChain, IKParameters, follow, solve_seeds
@@ -177,8 +177,7 @@ def _with_clearance_note(context: PlanningContext, result: PlanResult) -> PlanRe
 
 def _poses(T_start: Pose, T_end: Pose) -> Poses:
     """Poses T_base_link along the line, evenly spaced, without the start and with the end."""
-    displacement = T_end[:3, 3] - T_start[:3, 3]
-    turn = rotation_vector(T_end[:3, :3] @ T_start[:3, :3].T)
+    displacement, turn = pose_difference(T_start, T_end)
     angle = float(np.linalg.norm(turn))
     count = max(np.linalg.norm(displacement) / STEP, angle / TURN_STEP, MIN_STEPS)
     fractions = np.linspace(0, 1, min(int(np.ceil(count)), MAX_STEPS) + 1)[1:, None]

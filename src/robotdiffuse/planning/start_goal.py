@@ -445,32 +445,31 @@ def _pose_goals(
             context.note(note)
         return _with_turns(context, configurations)
     base = np.eye(4) if problem.T_world_base is None else problem.T_world_base
-    in_world = [(base @ pose.T_base_frame)[:3, 3] for pose in poses_of(goal)]  # as in files and workspaces
-    places = [", ".join(f"{value:.3f}" for value in xyz) for xyz in in_world]
-    place_of = {pose.frame: f"({xyz}) m" for pose, xyz in zip(poses_of(goal), places, strict=True)}
+    place_of = dict[str, str]()
+    for pose in poses_of(goal):
+        x, y, z = (base @ pose.T_base_frame)[:3, 3]  # in the world, as in files and workspaces
+        place_of[pose.frame] = f"({x:.3f}, {y:.3f}, {z:.3f}) m"
     of_poses = "the pose of " + " and of ".join(f"{frame} at {place}" for frame, place in place_of.items())
+    if len(rejected):
+        collision = _explained(robot, scene, rejected[0])
+        return context.fail(
+            Status.INVALID_GOAL,
+            f"all {len(rejected)} configurations checked for {of_poses} are in collision, e.g. {collision}",
+        )
     unconstrained = replace(problem, constraints=())
-    if not len(rejected) and context.validator.constraints is not None:
+    if context.validator.constraints is not None:
         reached = pose_configurations(unconstrained, goal, rng)
         wrong = context.validator.constraints.worst_violation(reached[0]) if len(reached) else None
         if wrong is not None:
             prefix = f"no configuration was found for {of_poses} that keeps the"
             return context.fail(Status.INVALID_GOAL, f"{prefix} constraints, e.g. {wrong.message}")
-    if not len(rejected):
-        # of several poses, name those that cannot be reached even alone, or all
-        several = poses_of(goal) if len(place_of) > 1 else ()
-        unreachable = [
-            pose.frame for pose in several if not len(pose_configurations(unconstrained, pose, rng))
-        ]
-        frames = unreachable or place_of
-        unreached = " and ".join(f"{frame} to the pose at {place_of[frame]}" for frame in frames)
-        return context.fail(
-            Status.UNREACHABLE_GOAL, f"no configuration within the joint limits brings {unreached}"
-        )
-    collision = _explained(robot, scene, rejected[0])
+    # of several poses, name those that cannot be reached even alone, or all
+    several = poses_of(goal) if len(place_of) > 1 else ()
+    unreachable = [pose.frame for pose in several if not len(pose_configurations(unconstrained, pose, rng))]
+    frames = unreachable or place_of
+    unreached = " and ".join(f"{frame} to the pose at {place_of[frame]}" for frame in frames)
     return context.fail(
-        Status.INVALID_GOAL,
-        f"all {len(rejected)} configurations checked for {of_poses} are in collision, e.g. {collision}",
+        Status.UNREACHABLE_GOAL, f"no configuration within the joint limits brings {unreached}"
     )
 
 

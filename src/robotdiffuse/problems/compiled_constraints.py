@@ -22,7 +22,6 @@ from robotdiffuse.core.types import (
     JointValues,
     Mask,
     Pose,
-    Rotation,
     Values,
     Vector,
     arc_lengths,
@@ -269,7 +268,7 @@ def _rows(problem: Problem, constraint: Constraint) -> list[_Row]:
 def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
     T_start = problem.robot.fk(problem.start, line.frame)
     T_goal = line_end(problem, line)
-    displacement = T_goal[:3, 3] - T_start[:3, 3]
+    displacement, turn = pose_difference(T_start, T_goal)
     length = float(np.linalg.norm(displacement))
     place = transform(
         T_start[:3, 3] + displacement / 2,
@@ -279,7 +278,6 @@ def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
     rows = [_Row(DISTANCE, line.tolerance, line.tolerance, place, half, half)]
     if line.angle is None:
         return rows
-    turn = rotation_vector(T_goal[:3, :3] @ T_start[:3, :3].T)
     total_angle = float(np.linalg.norm(turn))
     if length < MIN_LINE_LENGTH and total_angle > 0:
         # The link turns in place. Two cones express this: the axis of the turn keeps its direction, and a
@@ -328,15 +326,18 @@ def line_end(problem: Problem, line: CartesianLine) -> Pose:
     )
 
 
-def rotation_vector(rotation: Rotation) -> Vector:
-    """The rotation's axis times its angle [rad]; accurate also near half a turn."""
+def pose_difference(T_start: Pose, T_end: Pose) -> tuple[Vector, Vector]:
+    """The displacement from one pose to another [m], and the axis of the turn times its angle [rad], both in
+    the axes of the base; accurate also near half a turn."""
+    displacement = T_end[:3, 3] - T_start[:3, 3]
+    rotation = T_end[:3, :3] @ T_start[:3, :3].T
     angle = rotation_angle(rotation)
     if angle < 1e-12:
-        return np.zeros(3)
+        return displacement, np.zeros(3)
     # R + R^T has the axis as the eigenvector of its largest eigenvalue; R - R^T gives the sign
     axis = np.linalg.eigh(rotation + rotation.T)[1][:, -1]
     skew = rotation[[2, 0, 1], [1, 2, 0]] - rotation[[1, 2, 0], [2, 0, 1]]
-    return angle * axis * (-1.0 if skew @ axis < 0 else 1.0)
+    return displacement, angle * axis * (-1.0 if skew @ axis < 0 else 1.0)
 
 
 def _pose_rows(pose: PoseGoal, position: float, angle: float) -> list[_Row]:

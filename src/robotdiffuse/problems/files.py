@@ -59,6 +59,7 @@ from robotdiffuse.problems.fields import (
 from robotdiffuse.problems.moveit import (
     MoveItRequest,
     at_state,
+    joint_notes,
     moveit_frames,
     moveit_model,
     moveit_request,
@@ -312,21 +313,19 @@ def _requested(
             why = f"mimics {joint.mimic.joint} and is" if joint.mimic else "is"
             notes.append(f"start_state: {joint.name} is {start_value:g}, but it {why} held at {locked:g}")
 
-    for i, values in enumerate(request.joint_goals):
+    for place, values in request.joint_goals.items():
         for name, value in values.items():
             locked_value = robot.locked.get(name, value)
             if abs(locked_value - value) > MIMIC_SLACK:
-                notes.append(
-                    f"goal_constraints[{i}]: {name} is {value:g}, but it is held at {locked_value:g}"
-                )
+                notes.append(f"{place}: {name} is {value:g}, but it is held at {locked_value:g}")
     start = robot.planned_values("start_state", request.start)
     for attached in request.attached:
         robot = attached.held_by(robot, start)
     if request.pose_goal is not None:
         goal: Goal = PoseGoal(*request.pose_goal)
     else:
-        goals = enumerate(request.joint_goals)
-        goal = JointGoal([robot.planned_values(f"goal_constraints[{i}]", values) for i, values in goals])
+        goals = request.joint_goals.items()
+        goal = JointGoal([robot.planned_values(place, values) for place, values in goals])
     return Problem(robot, scene, start, goal, notes=tuple(notes), **options)
 
 
@@ -376,7 +375,7 @@ def _problem(
         check_type("allowed_contacts", contacts, dict, "a mapping of obstacles to lists of links, or to all")
         if from_moveit:
             with located(scene_place):
-                scene = moveit_scene(content, frames, Path(scene_place).parent, names, contacts)
+                scene = moveit_scene(content, frames, Path(scene_place).parent, names, contacts.items())
         else:
             scene, scene_notes = read_scene(values["scene"], folder, contacts)
             notes += scene_notes
@@ -388,7 +387,9 @@ def _problem(
         }
         if request is not None:
             with located(request_place):
-                notes += request.robot_notes(robot, moveit_model(content), ignore_joints)
+                states = {"start_state.joint_state": request.start, **request.joint_goals}
+                for place, state in states.items():
+                    notes += joint_notes(place, state, robot, moveit_model(content), ignore_joints)
                 # as in MoveIt, joints that the request leaves out start where the scene has them
                 mimics = {joint.name for joint in robot.joints if joint.mimic is not None}
                 current = {name: value for name, value in scene_state(content).items() if name not in mimics}

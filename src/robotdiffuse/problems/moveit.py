@@ -256,12 +256,16 @@ def _root_pose(location: str, floating: JsonObject) -> Pose | None:
 
 
 def moveit_scene(
-    data: object, frames: MoveItFrames, folder: Path, links: Collection[str] = (), contacts: object = ()
+    data: object,
+    frames: MoveItFrames,
+    folder: Path,
+    links: Collection[str] = (),
+    contacts: Iterable[tuple[str, Any]] = (),
 ) -> Scene:
     """`read_moveit_scene` for a parsed file; names of mesh files are relative to `folder`.
 
     links: names of the robot's links and held objects. contacts: allowed contacts in addition to those of the
-    file, in the form that `Scene` accepts.
+    file, as pairs that `Scene` accepts.
     """
     check_fields(SCENE, data, (), SCENE_FIELDS)
     world = check_fields("world", mapping_of(SCENE, data, "world"), (), ("collision_objects", "octomap"))
@@ -272,11 +276,7 @@ def moveit_scene(
             shapes.extend(object_shapes(object_entry, frames, folder))
     names = dict.fromkeys(shape.name for shape in shapes)
     allowed = matrix_contacts(mapping_of(SCENE, data, MATRIX), names, links)
-    scene = Scene(shapes, allowed)
-    additional = Scene(shapes, contacts).allowed_contacts  # type: ignore[arg-type]
-    # Both use the unique names that `Scene` gave the shapes, so take `scene.shapes`: in `shapes`, the unique
-    # name of one shape may be the original name of another.
-    return Scene(scene.shapes, (*scene.allowed_contacts, *additional))
+    return Scene(shapes, [*allowed.items(), *contacts])
 
 
 def matrix_contacts(
@@ -541,21 +541,13 @@ class MoveItRequest:
 
     start: dict[str, float]
     """Joint values by name [rad] or [m], including fingers."""
-    joint_goals: tuple[dict[str, float], ...] = ()
-    """Alternative goals, each with joint values by name."""
-    pose_goal: tuple[str, Pose] | None = None
+    joint_goals: dict[str, dict[str, float]]
+    """Alternative goals, each with joint values by name, by their places in the request, for messages."""
+    pose_goal: tuple[str, Pose] | None
     """A link and its goal pose T_base_link."""
-    attached: tuple[MoveItAttached, ...] = ()
-    notes: tuple[str, ...] = ()
+    attached: tuple[MoveItAttached, ...]
+    notes: tuple[str, ...]
     """Notes on parts of the request that are ignored."""
-
-    def robot_notes(self, robot: Robot, model: str, ignore_joints: bool) -> tuple[str, ...]:
-        """Notes on joints of start and goals that the robot lacks; see `joint_notes`. model: the
-        robot_model_name of the request's scene."""
-        notes = joint_notes("start_state.joint_state", self.start, robot, model, ignore_joints)
-        for i, goal in enumerate(self.joint_goals):
-            notes += joint_notes(f"goal_constraints[{i}]", goal, robot, model, ignore_joints)
-        return notes
 
 
 def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) -> MoveItRequest:
@@ -612,13 +604,13 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
         raise InputError("goal_constraints is empty; it must hold at least one goal")
     for goal_name, goal in goals:
         check_fields(goal_name, goal, (), GOAL_FIELDS)
-    joint_goals = ()
+    joint_goals = {}
     pose_goal = None
     pose_fields = ("position_constraints", "orientation_constraints")
     if len(goals) == 1 and any(map(goals[0][1].get, pose_fields)):
         pose_goal = _pose_goal(*goals[0], frames, notes)
     else:
-        joint_goals = tuple(_joint_goal(*goal, notes) for goal in goals)
+        joint_goals = {place: _joint_goal(place, goal, notes) for place, goal in goals}
     return MoveItRequest(start, joint_goals, pose_goal, attached, tuple(notes))
 
 

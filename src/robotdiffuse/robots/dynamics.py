@@ -44,10 +44,6 @@ class Stretches(NamedTuple):
 class Body(NamedTuple):
     """The body that moves with a joint, in the joint's frame."""
 
-    parent: int
-    """Index of the joint before this one in the tree; -1 if there is none."""
-    slides: bool
-    """Whether the joint is prismatic."""
     offset: float
     """Distance between the origins of the joint's frame and of the parent's frame, with a prismatic joint at
     zero [m]."""
@@ -108,16 +104,12 @@ class Dynamics:
         self._model, self._data = model, model.createData()
         self._bodies = [
             Body(
-                int(robot.parents[j]) - 1,
-                bool(robot.prismatic[j]),
                 float(np.linalg.norm(T[:3, 3])),
                 float(inertia.mass),
                 float(np.linalg.norm(inertia.lever)),
                 float(np.linalg.eigvalsh(inertia.inertia)[-1]),
             )
-            for j, (T, inertia) in enumerate(
-                zip(robot.frame_offsets, model.inertias.tolist()[1:], strict=True)
-            )
+            for T, inertia in zip(robot.frame_offsets, model.inertias.tolist()[1:], strict=True)
         ]
 
     def torques(self, q: Configurations, v: Configurations, a: Configurations) -> Configurations:
@@ -130,30 +122,29 @@ class Dynamics:
     def second_derivatives(self, along: Stretches) -> Configurations:
         """Bounds on the second derivatives of torques with respect to the fraction of the stretch, for each
         stretch and joint."""
-        bodies = self._bodies
+        parents = self.robot.parents
+        slides = self.robot.prismatic
         still = np.zeros((3, len(along.q)))
         weight = still.copy()
         weight[0] = GRAVITY
         # From the base to the tips, for each frame: its rate of rotation (by the fraction of the stretch),
         # its angular velocity omega and angular acceleration alpha (by time), and the acceleration of its
         # origin. The base accelerates upwards in place of gravity.
-        frames = list[tuple[Jet, Jet, Jet, Jet]]()
+        frames = [(still, still, still, weight)]
         axes = list[Jet]()
         arms = list[Jet]()
-        for j, body in enumerate(bodies):
-            rotation, omega, alpha, linear = (
-                frames[body.parent] if body.parent >= 0 else (still, still, still, weight)
-            )
+        for j, body in enumerate(self._bodies):
+            rotation, omega, alpha, linear = frames[parents[j]]
             axis = _fixed(1.0, rotation)
             arm = _fixed(body.offset, rotation)
             v = along.v[:, :, j]
             speed = along.speed[:, :, j]
             joint_acceleration = along.acceleration[:, :, j]
             along_axis = product(speed, axis)
-            if body.slides:
+            if slides[j]:
                 arm = arm + product(np.stack([along.q[:, j], v[0], v[1]]), axis)
             linear = linear + product(alpha, arm) + product(omega, product(omega, arm))
-            if body.slides:
+            if slides[j]:
                 linear = linear + product(joint_acceleration, axis) + 2 * product(omega, along_axis)
             else:
                 alpha = alpha + product(joint_acceleration, axis) + product(omega, along_axis)
@@ -163,12 +154,12 @@ class Dynamics:
             axes.append(axis)
             arms.append(arm)
         # from the tips to the base: the force and moment that move each body and all bodies after it, and
-        # their components along the joints
-        forces = [still] * len(bodies)
-        moments = [still] * len(bodies)
+        # their components along the joints; `forces` and `moments` sum those of the bodies after a frame
+        forces = [still] * len(frames)
+        moments = [still] * len(frames)
         bounds = np.empty(along.q.shape)
-        for j in reversed(range(len(bodies))):
-            body, (rotation, omega, alpha, linear) = bodies[j], frames[j]
+        for j in reversed(range(len(axes))):
+            body, parent, (rotation, omega, alpha, linear) = self._bodies[j], parents[j], frames[j + 1]
             lever = _fixed(body.lever, rotation)
             body_force = body.mass * (linear + product(alpha, lever) + product(omega, product(omega, lever)))
             # bounds on R I R^T and its first two derivatives; R occurs twice, hence the factors 2 and 4
@@ -178,12 +169,11 @@ class Dynamics:
             body_moment = (
                 product(inertia, alpha) + product(omega, product(inertia, omega)) + product(lever, body_force)
             )
-            forces[j] = forces[j] + body_force
-            moments[j] = moments[j] + body_moment
-            bounds[:, j] = product(axes[j], forces[j] if body.slides else moments[j])[2]
-            if body.parent >= 0:
-                forces[body.parent] = forces[body.parent] + forces[j]
-                moments[body.parent] = moments[body.parent] + moments[j] + product(arms[j], forces[j])
+            force = forces[j + 1] + body_force
+            moment = moments[j + 1] + body_moment
+            bounds[:, j] = product(axes[j], force if slides[j] else moment)[2]
+            forces[parent] = forces[parent] + force
+            moments[parent] = moments[parent] + moment + product(arms[j], force)
         return bounds
 
     def holding_torques(self, q: Configurations) -> Configurations:

@@ -556,8 +556,7 @@ class HeightMap(_Posed, Triangulated):
 
     @cached_property
     def mesh(self) -> Mesh:
-        rows, columns = self.heights.shape
-        y, x = np.meshgrid(np.arange(rows) * self.cell, np.arange(columns) * self.cell, indexing="ij")
+        y, x = np.indices(self.heights.shape) * self.cell
         vertices = np.stack([x, y, np.nan_to_num(self.heights)], axis=-1).reshape(-1, 3)
         used, faces = np.unique(self._faces, return_inverse=True)
-        return Mesh(vertices[used], faces.reshape(-1, 3), self.xyz, self.wxyz, name=self.name)
+        return Mesh(vertices[used], faces, self.xyz, self.wxyz, name=self.name)

@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.core.settings import Bound, Natural, NotNegative, Positive, Settings
+from robotdiffuse.core.settings import Natural, NotNegative, Positive, Settings, ShareBetween
 from robotdiffuse.core.transforms import inverse, rotation_angle, rpy_from_rotation
 from robotdiffuse.core.types import (
     Configuration,
@@ -65,7 +65,7 @@ class VerifySettings(Settings, name="verify"):
     """Reversals are counted between rows that are at least this far apart [rad, joint-space L2]."""
     reversals: Natural = 3
     """Largest allowed number of sharp reversals; a motion with more of them twitches."""
-    tightness: Annotated[float, Bound(above=0.0, below=1.0)] = 0.5
+    tightness: ShareBetween = 0.5
     """The certified clearances of a `Report` are at least this fraction of the smallest measured clearance,
     before the deviation of a trajectory's cubics is subtracted."""
 

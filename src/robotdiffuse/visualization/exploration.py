@@ -13,7 +13,7 @@ from PIL import Image
 
 from robotdiffuse.core.files import JsonObject, check_output, write_atomically
 from robotdiffuse.core.transforms import placed
-from robotdiffuse.core.types import Mask, Path, Points, Trajectory, frozen_dataclass
+from robotdiffuse.core.types import Mask, Path, Points, Trajectory
 from robotdiffuse.drawables import ASSUMED, OBSERVED, Color, Surface, drawables, painted
 from robotdiffuse.perception.seen_points import near_scene
 from robotdiffuse.perception.voxel_grid import MAP, Voxels
@@ -70,39 +70,18 @@ LAYERS = (
 """Layers of voxels on the page; `order` is the order in which see-through layers are drawn."""
 
 
-@frozen_dataclass
-class Moment:
-    """A step of the exploration, and what was known about the scene when it was chosen and during its
-    motion."""
-
-    number: int
-    """Number of the step, counted from 1."""
-    record: RecordedStep
-    """The step."""
-    views: list[RecordedView]
-    """The last view before the step, then the views that were taken during its motion."""
-
-    @property
-    def known(self) -> RecordedView:
-        """What was known when the step was chosen: the map after the last view before it."""
-        return self.views[0]
-
-
 def shares(known: RecordedView) -> Facts:
     """Labels and values of two fractions of the map: seen free, and unknown."""
     parts = (("seen free", known.free), ("unknown", known.unknown))
     return [(name, f"{100 * voxels.mean():.0f} %") for name, voxels in parts]
 
 
-def moments(explorer: RecordedExplorer) -> list[Moment]:
-    """The moments of all steps before which there was a view, in order."""
-    recorded = []
-    for index, record in enumerate(explorer.steps):
-        before = [view for view in explorer.views if view.step_index < index]
-        during = [view for view in explorer.views if view.step_index == index]
-        if before:
-            recorded.append(Moment(index + 1, record, [before[-1], *during]))
-    return recorded
+def views_of(explorer: RecordedExplorer, index: int) -> list[RecordedView]:
+    """What was known about the scene when the step with this index was chosen (the last view before the
+    step), and then during its motion (the views that were taken)."""
+    before = [view for view in explorer.views if view.step_index < index]
+    during = [view for view in explorer.views if view.step_index == index]
+    return [before[-1], *during]
 
 
 def title(record: RecordedStep) -> str:
@@ -199,13 +178,12 @@ def write_exploration_picture(explorer: RecordedExplorer, scene: Scene, file: st
     the view. Raises InputError for a file name with another ending, or a file that cannot be written.
     """
     path = check_output(file, (".png",))
-    all_moments = moments(explorer)
-    chosen = _chosen(len(all_moments))
-    waypoints = np.concatenate([moment.record.waypoints for moment in all_moments])
+    chosen = _chosen(len(explorer.steps))
+    waypoints = np.concatenate([record.waypoints for record in explorer.steps])
     size = TILE.width, TILE.height
     camera = view_of_motion(DrawnArm(explorer.robot), drawables(scene), waypoints, size, MARGINS)
     in_scene = in_known_scene(explorer)
-    save_png(_joined([_tile(explorer, all_moments[i], in_scene, camera) for i in chosen]), path)
+    save_png(_joined([_tile(explorer, i, in_scene, camera) for i in chosen]), path)
 
 
 def _chosen(count: int) -> list[int]:
@@ -216,10 +194,11 @@ def _chosen(count: int) -> list[int]:
     return [*np.linspace(0, count - 3, MAX_MOMENTS - 2).round().astype(int), count - 2, count - 1]
 
 
-def _tile(explorer: RecordedExplorer, moment: Moment, in_scene: Voxels, camera: Camera) -> Image.Image:
+def _tile(explorer: RecordedExplorer, index: int, in_scene: Voxels, camera: Camera) -> Image.Image:
     robot = explorer.robot
-    record = moment.record
-    layers = shown_voxels(moment.known, record, in_scene)
+    record = explorer.steps[index]
+    known = views_of(explorer, index)[0]
+    layers = shown_voxels(known, record, in_scene)
     occupied, predicted, unknown = (
         faces_surface(*pair, color) for pair, color in zip(layers, (OBSERVED, WHITE, WHITE), strict=True)
     )
@@ -236,9 +215,9 @@ def _tile(explorer: RecordedExplorer, moment: Moment, in_scene: Voxels, camera: 
         **({} if record.predicted is None else {"predicted": ASSUMED}),
         **({"next look": LOOK_COLOR} if look else {}),
     }
-    facts = [*shares(moment.known), *((name, "") for name in legend)]
+    facts = [*shares(known), *((name, "") for name in legend)]
     colors = (*SHARE_COLORS, *legend.values())
-    caption(image, f"{moment.number}  {title(moment.record)}", facts, colors, CAPTION_SIZE)
+    caption(image, f"{index + 1}  {title(record)}", facts, colors, CAPTION_SIZE)
     return image
 
 
@@ -270,7 +249,7 @@ def write_exploration(explorer: RecordedExplorer, scene: Scene, file: str | File
         "layers": LAYERS,
         "look_color": LOOK_COLOR,
         "known": _known(explorer),
-        "steps": [_step(explorer, moment) for moment in moments(explorer)],
+        "steps": [_step(explorer, index) for index in range(len(explorer.steps))],
         "true_scene": data["scene"],
     }
     data["scene"] = page_shapes(explorer.scene)
@@ -313,10 +292,8 @@ def _known(explorer: RecordedExplorer) -> list[JsonObject]:
     known_scene = in_known_scene(explorer)
     before = [np.zeros(0, np.int64) for _ in LAYERS]
     states = []
-    for moment in moments(explorer):
-        record = moment.record
-        for i, view in enumerate(moment.views):
-            index = moment.number - 1
+    for index, record in enumerate(explorer.steps):
+        for i, view in enumerate(views_of(explorer, index)):
             time = _page_time(view.time, index) if i else _page_time(record.begins, index - 1)
             layers = shown_voxels(view, record, known_scene)
             after = [faces_between(*pair)[0] for pair in layers]
@@ -336,15 +313,15 @@ def _packed(numbers: Int[ndarray, "n"]) -> str:
     return in_base64((groups + 128 * marked)[used].astype(np.uint8))
 
 
-def _step(explorer: RecordedExplorer, moment: Moment) -> JsonObject:
-    record = moment.record
+def _step(explorer: RecordedExplorer, index: int) -> JsonObject:
+    record = explorer.steps[index]
     moves = record.step.kind == LOOK and record.step.motion is not None
     end = record.waypoints[-1] if moves else None
     return {
-        "time": _page_time(record.begins, moment.number - 2),
-        "title": f"{moment.number}  {title(moment.record)}",
+        "time": _page_time(record.begins, index - 1),
+        "title": f"{index + 1}  {title(record)}",
         "reason": record.step.reason,
-        "known": ", ".join(f"{value} {name}" for name, value in shares(moment.known)),
+        "known": ", ".join(f"{value} {name}" for name, value in shares(views_of(explorer, index)[0])),
         "look": [np.round(edge, 4).tolist() for edge in frustum(explorer, record)],
         "end": None if end is None else np.round(end, 5).tolist(),
     }

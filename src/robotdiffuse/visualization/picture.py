@@ -78,8 +78,7 @@ class DrawnArm:
 
     def frames(self, q: Float[ndarray, "*batch dof"]) -> Float[ndarray, "*batch frames 4 4"]:
         """T_base_frame of all dof + 1 frames at each configuration."""
-        T = forward_frames(self.robot, q.reshape(-1, self.robot.dof))
-        return T.reshape(*q.shape[:-1], *T.shape[1:])
+        return forward_frames(self.robot, q)
 
     def posed(self, q: Configuration, begin: int = 0) -> Surface:
         """The surface of the arm at a configuration, in the base frame. Only frames from `begin` on are

@@ -28,7 +28,8 @@ def clearances(motion: rd.Trajectory, obstacle: rd.MovingObstacle) -> list[float
     found = list[float]()
     for t in np.arange(0.0, motion.duration, 0.02):
         exact = ExactCollision(PANDA, rd.Scene([obstacle.at(t)]))
-        found.append(min(d.distance for d in exact.link_distances(motion.at(t).positions)))
+        distances = exact.distances(motion.at(t).positions)
+        found.append(min(d.distance for d in distances if d.other not in PANDA.link_names))
     return found
 
 

@@ -252,7 +252,7 @@ def test_a_table_is_left_aside_where_a_joint_is_held_or_its_joints_are_others() 
     (table,) = robot.tables
     # regression: where a table says that links are apart, their clearance was 1 m
     problem = rd.Problem(robot, rd.Scene(), np.zeros(robot.dof), np.full(robot.dof, 0.05))
-    near = min(pair.distance for pair in ExactCollision(robot, rd.Scene()).pair_distances(problem.start))
+    near = min(pair.distance for pair in ExactCollision(robot, rd.Scene()).distances(problem.start))
     assert problem.clearance_at(problem.start) <= near
     for other in (robot.with_locked({"spin": 0.3}), replace(robot, tables=(replace(table, joints=table.joints[::-1]),))):
         assert shares(other) == (1.0, 0)

@@ -3,7 +3,6 @@
 The residual stream is fp32; under autocast the linear layers are bf16.
 """
 
-from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
@@ -113,8 +112,9 @@ def start_at_zero(layer: nn.Linear) -> None:
     nn.init.zeros_(layer.bias)
 
 
-class Denoiser(nn.Module, ABC):
-    """A network from a noisy trajectory to the output that the model's objective defines."""
+class Denoiser(nn.Module):
+    """A network from a noisy trajectory to the output that the model's objective defines. A subclass defines
+    `forward`, see `TrajectoryTransformer.forward`."""
 
     out: nn.Linear
     """The last layer. It starts at zero, so that an untrained network outputs zeros, which stand for the
@@ -130,15 +130,6 @@ class Denoiser(nn.Module, ABC):
         self.settings = settings
         self.waypoints = waypoints
         self.dof = dof
-
-    @abstractmethod
-    def forward(
-        self,
-        features: Features,
-        level: Levels,
-        condition: Conditions,
-    ) -> Trajectories:
-        """The output for noisy trajectories; level is t / T in [0, 1]."""
 
 
 class Block(nn.Module):

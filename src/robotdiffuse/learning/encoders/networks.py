@@ -36,22 +36,19 @@ Ordered = Float[Tensor, "batch cloud 3"]
 Loss = tuple[Scalar, dict[str, float]]
 
 
-class Encoder(SavedModule, ABC):
+class Encoder(SavedModule):
     """A network from a point cloud to z. The order of the points does not matter, and a cloud may be
-    empty."""
+    empty.
+
+    A subclass defines `forward(cloud)`, which returns z, float32, of each cloud of points [m]. Points outside
+    the region are ignored, so that clouds of different size can share a batch.
+    """
 
     settings: EncoderSettings
 
     def __init__(self, settings: EncoderSettings) -> None:
         super().__init__()
         self.settings = settings
-
-    @abstractmethod
-    def forward(self, cloud: Cloud) -> Codes:
-        """z, float32, of each cloud of points [m].
-
-        Points outside the region are ignored, so that clouds of different size can share a batch.
-        """
 
     def code_of_ordered(self, cloud: Cloud) -> Codes:
         """z of clouds that already have the size and order of `EncoderSettings.prepared`; for export."""
@@ -68,7 +65,7 @@ class Encoder(SavedModule, ABC):
         return torch.from_numpy(np.stack(ordered)).to(cloud.device)
 
 
-class Autoencoder(Encoder):
+class Autoencoder(Encoder, ABC):
     """An encoder that is trained alone, to reconstruct its input."""
 
     mean: Tensor

@@ -297,7 +297,7 @@ class Batches:
         )
         noise = model.draw_noise(len(rows), rng)
         noisy = signal * clean + noise_level * noise
-        target = model.objective.target(clean, noise, signal, noise_level)
+        target = model.objective.target(clean, noise)
         weight = model.objective.weight(schedule, levels, self.weight_limit)
         per_output = model.objective.clean_per_output(schedule.signal[levels], schedule.noise[levels])
         clamped = model.hold_ends(noisy.copy(), reference)

@@ -345,17 +345,12 @@ class TrainingRun:
     @contextmanager
     def averaged(self) -> Iterator[None]:
         """A context in which the module has the moving average of its weights."""
-        now = [p.detach().clone() for p in self.parameters]
-        self._set(self.average.parameters())
+        now = copy.deepcopy(self.parameters.state_dict())
+        self.parameters.load_state_dict(self.average.module.state_dict())
         try:
             yield
         finally:
-            self._set(now)
-
-    @torch.no_grad()
-    def _set(self, values: Iterable[Tensor]) -> None:
-        for p, value in zip(self.parameters, values, strict=True):
-            p.copy_(value)
+            self.parameters.load_state_dict(now)
 
     def _log(self, validation: Validation | None) -> None:
         # the mean since the last row; if every step was skipped, that of the last row

@@ -168,7 +168,7 @@ def planning_success(
 
 
 def _guided(guidance: CollisionGuidance, q: ndarray, _level: float) -> ndarray:
-    return guidance(q, PRIOR_GUIDANCE_STEPS)[0]
+    return guidance(q, PRIOR_GUIDANCE_STEPS)
 
 
 VALIDATION_SAMPLES = 4

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from robotdiffuse.core.errors import InputError, positive, rigid_transform, shown, vector
-from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
+from robotdiffuse.core.settings import Count, Natural, OneOf, Positive, Settings, Share
 from robotdiffuse.core.types import Configurations, PlanResult, Pose, Poses, Value, frozen_dataclass
 from robotdiffuse.perception.depth_view import checked_intrinsics
 from robotdiffuse.perception.voxel_grid import Voxels
@@ -72,7 +72,7 @@ class ExplorerSettings(Settings, name="explorer"):
     policy: Annotated[str, OneOf(POLICIES)] = STRICT
     """strict: motions only through space seen free; probabilistic: motions whose stated confidence is high
     enough; strict_then_probabilistic: the probabilistic policy where the strict policy finds no step."""
-    confidence: Annotated[float, Bound(least=0.0, most=1.0)] = 0.98
+    confidence: Share = 0.98
     """Minimum stated confidence of motions under the probabilistic policy."""
     time_limit: Positive = 1.0
     """Time limit of each search [s]."""

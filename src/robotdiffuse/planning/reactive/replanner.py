@@ -85,7 +85,7 @@ from robotdiffuse.trajectories.timing_kernel import (
     states_at,
 )
 from robotdiffuse.validation.tolerances import DEFAULT
-from robotdiffuse.validation.validator import Verifier, verifier
+from robotdiffuse.validation.validator import verifier
 
 # Fractions of the velocity and acceleration limits that are used; the remainder is a margin for the motion
 # between grid points.
@@ -133,41 +133,6 @@ class TimedPath:
     """Whether this path, or the last path that follows it, ends at the goal."""
     then: "TimedPath | None" = None
     """The path that follows after a stop at this path's end; None if this is the last path."""
-
-    @staticmethod
-    def certified(
-        validator: Verifier, waypoints: Configurations, to_goal: bool, jerk_filter: "JerkFilter"
-    ) -> "TimedPath | None":
-        """The path through waypoints; None if the validator refuses it, or if its length is below MIN_LENGTH.
-
-        A corner is rounded only if the rounded corner has a clearance of the filter's displacement, since the
-        filter moves the arm off the path by up to this distance. At other corners, the arm stops.
-        """
-        robot = validator.problem.robot
-        path = Path(robot.joint_names, waypoints)
-        if path.length < MIN_LENGTH or not validator.collision_free(path):
-            return None
-
-        contact = max(jerk_filter.displacement, DEFAULT.contact)
-        with_clearance = verifier(validator.problem, replace(DEFAULT, contact=contact))
-
-        def free_around(q: Configurations) -> bool:
-            return with_clearance.collision_free(Path(robot.joint_names, q))
-
-        free = validator.collision_free
-        rows, deviations, _ = time_parameterize(robot, path, free, free, keeps=free_around)
-        line = rounded_line(rows, deviations)
-        for i in np.flatnonzero(deviations):
-            if not free_around(
-                line(line.knots[i + 1] + line.half_widths[i] * np.linspace(-1, 1, CORNER_SAMPLES), 0)
-            ):
-                deviations[i] = 0.0
-        stops = [0, *(np.flatnonzero(deviations == 0) + 1).tolist(), len(rows) - 1]
-        timed = None
-        for first, last in reversed(list(pairwise(stops))):
-            part = line_with_widths(rows[first : last + 1], line.half_widths[first : last - 1])
-            timed = TimedPath(robot, jerk_filter.acceleration, part, to_goal, timed)
-        return timed
 
     @cached_property
     def _grid(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
@@ -630,12 +595,43 @@ class Replanner:
             raise InputError(f"the replanner cannot begin: {start_goal.reason}")
         search = AnytimeSearch.of(context, start_goal, SearchSettings(), "replanner", bounded=False)
         while search.first() and search.best is not None:
-            waypoints = start_goal.complete(search.best)
-            path = TimedPath.certified(self._validator, waypoints, True, self._filter)
+            path = self._certified(start_goal.complete(search.best))
             if path is not None:
                 return path, np.array(start_goal.goals), search_space(start_goal.checker, COARSE_RESOLUTION)
             search.refuse(None)
         raise InputError("the replanner cannot begin: no path was found in the static scene")
+
+    def _certified(self, waypoints: Configurations, to_goal: bool = True) -> TimedPath | None:
+        """The path through waypoints; None if the validator refuses it, or if its length is below MIN_LENGTH.
+
+        A corner is rounded only if the rounded corner has a clearance of the filter's displacement, since the
+        filter moves the arm off the path by up to this distance. At other corners, the arm stops.
+        """
+        robot = self._robot
+        free = self._validator.collision_free
+        path = Path(robot.joint_names, waypoints)
+        if path.length < MIN_LENGTH or not free(path):
+            return None
+
+        contact = max(self._filter.displacement, DEFAULT.contact)
+        with_clearance = verifier(self._still, replace(DEFAULT, contact=contact))
+
+        def free_around(q: Configurations) -> bool:
+            return with_clearance.collision_free(Path(robot.joint_names, q))
+
+        rows, deviations, _ = time_parameterize(robot, path, free, free, keeps=free_around)
+        line = rounded_line(rows, deviations)
+        for i in np.flatnonzero(deviations):
+            if not free_around(
+                line(line.knots[i + 1] + line.half_widths[i] * np.linspace(-1, 1, CORNER_SAMPLES), 0)
+            ):
+                deviations[i] = 0.0
+        stops = [0, *(np.flatnonzero(deviations == 0) + 1).tolist(), len(rows) - 1]
+        timed = None
+        for first, last in reversed(list(pairwise(stops))):
+            part = line_with_widths(rows[first : last + 1], line.half_widths[first : last - 1])
+            timed = TimedPath(robot, self._filter.acceleration, part, to_goal, timed)
+        return timed
 
     def _observe(self, observation: Mapping[str, ArrayLike], now: float) -> None:
         if not isinstance(observation, Mapping):
@@ -725,8 +721,7 @@ class Replanner:
         turns = self._robot.whole_turns(off)
         end = int(np.abs(off - turns).max(axis=1).argmin())
         after = old[end - len(self._goals) + 1 :] + turns[end] if end >= len(self._goals) else old[:0]
-        waypoints = np.concatenate([path, after])
-        return TimedPath.certified(self._validator, waypoints, True, self._filter)
+        return self._certified(np.concatenate([path, after]))
 
     def _evasion(self, predicted: PredictedObstacles, rest: Configuration, time: float) -> TimedPath | None:
         """A straight path from `rest` to the random configuration at which an obstacle is predicted to arrive
@@ -748,7 +743,7 @@ class Replanner:
                 if comes is None:
                     break
                 best_time = comes
-        return TimedPath.certified(self._validator, best, False, self._filter)
+        return self._certified(best, False)
 
     def _change_path(self) -> None:
         """If the arm rests, change to `_next`, which replaces the current path; if there is none and the

@@ -15,7 +15,6 @@ search: each path with the lowest estimated time so far is timed, and the call r
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
-from typing import Annotated
 
 import numpy as np
 from numpy import ndarray
@@ -24,7 +23,7 @@ from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import finer_resolution
 from robotdiffuse.core.loading import loading
-from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings
+from robotdiffuse.core.settings import Count, Natural, NotNegative, Positive, Settings, ShareBelowOne
 from robotdiffuse.core.types import (
     FIRST,
     LENGTH,
@@ -716,7 +715,7 @@ IMPROVEMENT_STEP = 1_000
 
 @dataclass(frozen=True)
 class AORRTCSettings(SearchSettings, name="aorrtc"):
-    gain: Annotated[float, Bound(least=0.0, below=1.0)] = 0.0025
+    gain: ShareBelowOne = 0.0025
     """With until="converged", the search ends when the last doubling of the number of iterations shortened
     the path by less than this fraction, but not before `patience` iterations."""
     patience: Natural = 16_000

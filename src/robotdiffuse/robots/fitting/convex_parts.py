@@ -35,9 +35,8 @@ def convex_hull(points: Points) -> ConvexMesh:
     """Convex hull with outward faces. The points are `thickened` first."""
     points = thickened(points)
     hull = ConvexHull(points)
-    used, index = np.unique(hull.simplices, return_inverse=True)
+    used, faces = np.unique(hull.simplices, return_inverse=True)
     vertices = points[used]
-    faces = index.reshape(hull.simplices.shape)
     inwards = np.einsum("fd,fd->f", scaled_normals(vertices[faces]), hull.equations[:, :3]) < 0
     faces[inwards] = faces[inwards][:, ::-1]
     return ConvexMesh(vertices, faces)

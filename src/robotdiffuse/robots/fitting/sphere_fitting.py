@@ -211,8 +211,7 @@ def is_inside(points: Points, planes: Planes, depth: float) -> Mask:
 
 def _grid_points(shape: tuple[int, ...] | ndarray, origin: Vector, spacing: float) -> Points:
     """Coordinates of all points of a grid [m]."""
-    axes = [low + spacing * np.arange(count) for low, count in zip(origin, shape, strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return origin + spacing * np.stack([*np.indices(tuple(shape))], axis=-1).reshape(-1, 3)
 
 
 MARGIN = 1e-5
@@ -381,10 +380,10 @@ class Cells(NamedTuple):
         count = len(points) - len(corners)
         points = points[first]
         sharp = np.zeros(len(points), bool)
-        sharp[index.ravel()[:count]] = True
+        sharp[index[:count]] = True
         # if triangles are left out or split to different sizes, any point may be a corner of the surface
         sharp |= irregular
-        return Cells(points, index.ravel()[count:].reshape(-1, 3), sharp)
+        return Cells(points, index[count:].reshape(-1, 3), sharp)
 
     def assigned(
         self, sizes: SphereSizeGrid, centers: Points
@@ -398,8 +397,8 @@ class Cells(NamedTuple):
         neighbors are missing in the part."""
         outside = np.zeros(len(self.points), bool)
         outside[self.corners[~mine]] = True
-        used, index = np.unique(self.corners[mine], return_inverse=True)
-        return Cells(self.points[used], index.reshape(-1, 3), (self.sharp | outside)[used])
+        used, corners = np.unique(self.corners[mine], return_inverse=True)
+        return Cells(self.points[used], corners, (self.sharp | outside)[used])
 
 
 def _relax(

@@ -311,13 +311,10 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
     `enough`.
     """
     cells = len(corners)
-    count = len(centers)
     first = np.empty(len(points), np.int64)
     collected_by = np.empty(len(points), np.int64)
     on_rim = np.empty(len(points), np.bool_)
     assigned_points = np.empty((len(points), 3))
-    order = np.empty(cells, np.int64)
-    ends = np.empty(count + 1, np.int64)
     centers = centers.copy()
     best = centers.copy()
     best_value = 1e9
@@ -336,29 +333,22 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
         # have several owners; all others are inside if these are. `first`: owner of a point's first cell.
         first[:] = -1
         on_rim[:] = sharp
-        ends[:] = 0
         for c in range(cells):
-            ends[owner[c] + 1] += 1
             for k in range(3):
                 p = corners[c, k]
                 if first[p] < 0:
                     first[p] = owner[c]
                 elif first[p] != owner[c]:
                     on_rim[p] = True
-        # `order` lists the cells by owner; those of sphere i are order[ends[i] : ends[i + 1]]
-        for i in range(count):
-            ends[i + 1] += ends[i]
-        fill = ends[:count].copy()
-        for c in range(cells):
-            order[fill[owner[c]]] = c
-            fill[owner[c]] += 1
         # move each sphere; `collected_by`: the last sphere for which a point was collected
         collected_by[:] = -1
-        for i in range(count):
+        for i in range(len(centers)):
             assigned_count = 0
-            for j in range(ends[i], ends[i + 1]):
+            for c in range(cells):
+                if owner[c] != i:
+                    continue
                 for k in range(3):
-                    p = corners[order[j], k]
+                    p = corners[c, k]
                     if on_rim[p] and collected_by[p] != i:
                         collected_by[p] = i
                         assigned_points[assigned_count] = points[p]

@@ -25,7 +25,7 @@ from robotdiffuse.core.transforms import (
     transform,
     xyzw_of,
 )
-from robotdiffuse.core.types import Mask, Pose, Quaternion, Values, Vector
+from robotdiffuse.core.types import Mask, Pose, Values, Vector
 from robotdiffuse.robots.fitting.convex_parts import convex_hull
 from robotdiffuse.robots.parsing.srdf import Srdf
 
@@ -179,7 +179,7 @@ class ConvertedModel:
         name = self.name("body", body)
         parent = int(model.body_parentid[body])
         above = "world" if parent == WORLD else self.name("body", parent)
-        T = _pose(model.body_pos[body], model.body_quat[body])
+        T = _pose(model.body(body))
         joints = _joints_of(model, [body])
         for joint in joints:
             label = self.name("joint", joint)
@@ -282,8 +282,8 @@ class ConvertedModel:
         model = self.model
         if model.body_mass[body] > 0:
             inertial = ET.SubElement(link, "inertial")
-            T = _pose(model.body_ipos[body], model.body_iquat[body])
-            _origin(inertial, T)
+            R = rotation_from_quaternion(model.body_iquat[body])
+            _origin(inertial, transform(model.body_ipos[body], R))
             ET.SubElement(inertial, "mass", value=repr(float(model.body_mass[body])))
             xx, yy, zz = map(repr, model.body_inertia[body].tolist())
             ET.SubElement(inertial, "inertia", ixx=xx, iyy=yy, izz=zz, ixy="0", ixz="0", iyz="0")
@@ -291,8 +291,7 @@ class ConvertedModel:
             if not self.colliding[geom] and kind_of("Geom", model.geom_type[geom]) not in GEOMS:
                 continue
             element = ET.SubElement(link, "collision" if self.colliding[geom] else "visual")
-            T = _pose(model.geom_pos[geom], model.geom_quat[geom])
-            _origin(element, T)
+            _origin(element, _pose(model.geom(geom)))
             self._shape(ET.SubElement(element, "geometry"), geom)
 
     def _shape(self, parent: ET.Element, geom: int) -> None:
@@ -337,7 +336,7 @@ class ConvertedModel:
             if body not in self.bodies:
                 continue
             link = name if name not in self.links else f"{name}_site"
-            T = _pose(self.model.site_pos[site], self.model.site_quat[site])
+            T = _pose(self.model.site(site))
             self._element(f"{link}_fixed", "fixed", self.name("body", body), link, T)
             self._link(link)
 
@@ -415,8 +414,9 @@ def _related(model: Any, first: int, second: int, unfiltered: bool) -> bool:
     return bool(welded[0] == welded[1] or (carried and WORLD not in welded and not unfiltered))
 
 
-def _pose(xyz: Vector, wxyz: Quaternion) -> Pose:
-    return transform(xyz, rotation_from_quaternion(wxyz))
+def _pose(part: Any) -> Pose:
+    """The pose of a body, geom or site in its parent."""
+    return transform(part.pos, rotation_from_quaternion(part.quat))
 
 
 def _origin(element: ET.Element, T: Pose) -> None:

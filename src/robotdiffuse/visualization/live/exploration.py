@@ -43,10 +43,10 @@ from robotdiffuse.visualization.exploration import (
     faces_surface,
     frustum,
     in_known_scene,
-    moments,
     shares,
     shown_voxels,
     title,
+    views_of,
 )
 from robotdiffuse.visualization.live.page import (
     GHOST_OPACITY,
@@ -216,9 +216,9 @@ class ExplorationSession:
     def _execute(self, run: int, explorer: RecordedExplorer) -> None:
         """Show the execution of the last step: move the arm along its motion, and show each view at the time
         at which it was taken."""
-        moment = moments(explorer)[-1]
-        record = moment.record
-        self._update(run, phase=MOVING, steps=tuple(explorer.steps), known=moment.known)
+        record = explorer.steps[-1]
+        views = views_of(explorer, len(explorer.steps) - 1)
+        self._update(run, phase=MOVING, steps=tuple(explorer.steps), known=views[0])
         at = -READING_TIME
         last = time.perf_counter()
         while record.trajectory is not None and at < record.duration:
@@ -231,7 +231,7 @@ class ExplorationSession:
             at = min(at + speed * (now - last), record.duration)
             last = now
             if at > 0:
-                taken_views = [view for view in moment.views if view.time <= record.begins + at]
+                taken_views = [view for view in views if view.time <= record.begins + at]
                 self._update(run, configuration=record.trajectory.at(at).positions, known=taken_views[-1])
 
     def _update(self, run: int, **changes: Any) -> ExplorationState:
@@ -395,7 +395,7 @@ class ExplorationPage(LivePage):
         self._look.show(None if look is None else look.waypoints[-1])
         edges = [] if look is None else frustum(explorer, look)
         width = 0.5 * TRACE_WIDTH * explorer.robot.reach
-        draw_lines(self.server, "/pyramid", edges, [np.array(LOOK_COLOR, float)] * len(edges), width)
+        draw_lines(self.server, "/pyramid", edges, LOOK_COLOR, width)
 
     def _show_panel(self, state: ExplorationState) -> None:
         paused = state.mode == PAUSED

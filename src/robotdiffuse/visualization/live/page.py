@@ -155,22 +155,22 @@ class Page(LivePage):
         self._drawn.frames(problem.start)
         with self.server.atomic():
             self._panel.show(state, validity(state), selected)
-            if new("scene", problem.scene, selected):
+            if new("scene", robot, problem.scene, selected):
                 self._obstacles.show(drawables(problem.scene), selected)
                 shapes = state.obstacles
                 self._obstacle_gizmo.show(own_frame(shapes[selected]) if selected in shapes else None)
             if new("moving", problem.moving):
                 self._show_moving(0.0)
             self._start_gizmo.show(robot.fk(problem.start))
-            if new("start", problem.start, state.motion):
+            if new("start", robot, problem.start, state.motion):
                 at_start = motion is None or np.allclose(motion.positions[0], problem.start)
                 self._arms["start"].show(None if at_start else problem.start)
-            if new("goal", state.goal_configuration):
+            if new("goal", robot, state.goal_configuration):
                 self._arms["goal"].show(state.goal_configuration)
             self.goal_gizmo.show(state.goal_pose)
-            if new("motion", problem.start if state.motion is None else state.motion):
+            if new("motion", robot, problem.start if state.motion is None else state.motion):
                 self._new_motion(motion, problem.start)
-            if new("validation", state.validation):
+            if new("validation", robot, state.validation):
                 contact = None
                 if violation is not None and motion is not None and violation.kind in COLLISIONS:
                     contact = interpolated(violation.time, motion.times, motion.positions)
@@ -178,7 +178,7 @@ class Page(LivePage):
             answer = state.answer
             tree_answer = answer if state.options.trees else None
             # until there is an answer, the trees of the last one stay visible
-            if (answer is not None or not state.options.trees) and new("trees", tree_answer):
+            if (answer is not None or not state.options.trees) and new("trees", robot, tree_answer):
                 draw_trees(self.server, self._drawn, () if tree_answer is None else tree_answer.trees)
 
     def _new_robot(self, robot: Robot) -> None:
@@ -199,7 +199,6 @@ class Page(LivePage):
         state = self.session.state
         self.server.set_first_view(self._drawn, state.problem, state.goal_configuration)
         draw_trees(self.server, self._drawn, ())
-        self._changes.forget("start", "goal", "motion", "validation", "scene", "trees")
 
     def _new_motion(self, motion: Trajectory | None, start: Configuration) -> None:
         frames = None
@@ -700,15 +699,14 @@ def draw_trace(server: viser.ViserServer, arm: DrawnArm, motion: Trajectory | No
     points = arm.trace(motion.positions)
     share = np.linspace(0, 1, len(points))[:, None]
     colors = (1 - share) * np.array(START) + share * np.array(GOAL)
-    draw_lines(server, "/trace", [points], [colors], TRACE_WIDTH * arm.robot.reach)
+    draw_lines(server, "/trace", [points], colors, TRACE_WIDTH * arm.robot.reach)
 
 
 def draw_trees(server: viser.ViserServer, arm: DrawnArm, trees: tuple[Tree, ...]) -> None:
     """Draw the tool's traces along the edges of both search trees, in the colors of start and goal."""
     for name, color, tree in zip(TREES, (START, GOAL), trees or (None, None), strict=True):
         edges = [] if tree is None else _edges(arm, tree)
-        colors = [np.array(color, float)] * len(edges)
-        draw_lines(server, name, edges, colors, TREE_WIDTH * arm.robot.reach)
+        draw_lines(server, name, edges, color, TREE_WIDTH * arm.robot.reach)
 
 
 def _edges(arm: DrawnArm, tree: Tree) -> list[Float[ndarray, "points 3"]]:
@@ -721,9 +719,10 @@ def _edges(arm: DrawnArm, tree: Tree) -> list[Float[ndarray, "points 3"]]:
 
 
 def draw_lines(
-    server: viser.ViserServer, name: str, lines: list[ndarray], colors: list[ndarray], width: float
+    server: viser.ViserServer, name: str, lines: list[ndarray], color: Color | ndarray, width: float
 ) -> None:
-    """Draw polylines, each in one color or with a color for each point. Without lines, the node is removed.
+    """Draw polylines in one color, or with a color for each of their points. Without lines, the node is
+    removed.
 
     `width` is in [m]. Colors are sRGB; they are converted because viser expects linear colors.
     """
@@ -731,7 +730,7 @@ def draw_lines(
         server.scene.remove_by_name(name)
         return
     points = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
-    point_colors = [np.broadcast_to(color, line.shape) for color, line in zip(colors, lines, strict=True)]
-    ends = np.concatenate([np.stack([color[:-1], color[1:]], axis=1) for color in point_colors])
+    point_colors = [np.broadcast_to(color, line.shape) for line in lines]
+    ends = np.concatenate([np.stack([rgb[:-1], rgb[1:]], axis=1) for rgb in point_colors])
     linear = np.round(255 * (ends / 255) ** GAMMA).astype(np.uint8)
     server.scene.add_line_segments(name, points.astype(np.float32), linear, thickness=width)

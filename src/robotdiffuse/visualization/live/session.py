@@ -575,11 +575,6 @@ class Changes:
         self._shown[what] = values
         return last_values is None or not all(map(_same, last_values, values))
 
-    def forget(self, *names: str) -> None:
-        """Forget the values of these names, so that their next values count as new."""
-        for name in names:
-            self._shown.pop(name, None)
-
 
 def _same(known: object, value: object) -> bool:
     plain = isinstance(value, str | bytes | bool | float | tuple)

@@ -499,7 +499,7 @@ def test_contacts_of_an_object_of_several_parts_are_not_those_of_another() -> No
     """Regression: the second part of `a` was renamed `a_2`, and the object a_2 could be touched like it."""
     two = {key: ball()[key] * 2 for key in ("primitives", "primitive_poses")}
     data = {"world": {"collision_objects": [ball(id="a", **two), ball(id="a_2")]}}
-    scene = moveit.moveit_scene(data, moveit.moveit_frames(data, PANDA), Path(), PANDA.link_names, {"a": ["panda_hand"]})
+    scene = moveit.moveit_scene(data, moveit.moveit_frames(data, PANDA), Path(), PANDA.link_names, [("a", ["panda_hand"])])
     assert [name for name, _ in scene.allowed_contacts] == ["a", "a_2"]  # the object a_2 is now a_2_2
 
 
