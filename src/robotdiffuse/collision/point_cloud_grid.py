@@ -48,6 +48,7 @@ def _join(spheres: Spheres, voxel: float) -> Spheres:
     if not len(spheres):
         return NO_SPHERES
     offsets = spheres[:, :3] - spheres[:, :3].min(axis=0)
+    # the number of a voxel and the index of a sphere fit into 62 bits, see `grouped`
     axis_bits = (62 - len(spheres).bit_length()) // 3
     xyz = (offsets * (1 / max(voxel, float(offsets.max()) / (2**axis_bits - 1)))).astype(np.int64)
     order, starts = grouped((xyz[:, 0] << (2 * axis_bits)) | (xyz[:, 1] << axis_bits) | xyz[:, 2])
@@ -116,8 +117,8 @@ def build_grid(cloud: Spheres, radius: float) -> tuple[ndarray, ...]:
     index = index[order]
     cell = cell[order]
     first = np.asarray(np.searchsorted(cell, np.arange(int(np.prod(cells)) + 1)), np.int32)
-    # up to `band` [m], stored distances are exact, which decides whether the largest sphere touches a point;
-    # beyond it they are lower bounds, and queries compute exact distances up to `exact_distance`
+    # up to `band` [m], stored distances are exact: enough to decide whether the largest sphere touches a
+    # point; beyond it they are lower bounds, and queries compute exact distances up to `exact_distance`
     band = np.float32(max(radius + float(radii.max()) + 1e-3, 2 * float(voxel)))
     # runs of points in the same voxel
     voxels = np.ravel_multi_index(index.T, shape.tolist())

@@ -8,7 +8,7 @@ the value of each must not exceed a limit:
   zero or infinite size along some of their axes.
 - CONE: the angle between an axis of the frame and a direction [rad].
 - TURN: the angle from the frame's orientation to the orientation that is interpolated along a segment, at the
-  frame's position [rad].
+  point of the segment that is nearest to the frame's origin [rad].
 - ROLL_PITCH_YAW: the largest excess of roll, pitch or yaw, relative to a reference, over its tolerance [rad].
   Only goals have such rows, not motions.
 

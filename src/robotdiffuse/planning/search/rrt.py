@@ -171,7 +171,7 @@ class AnytimeSearch:
         self.settings = settings
         self.name = name
         self.bounded = bounded
-        self.start, self.goals = start_goal.leads()
+        self.start, self.goals = start_goal.leads()  # or free configurations nearby
         self.best: Configurations | None = None
         """The path of the lowest cost so far, free at the resolution of the search."""
         self.length = np.float32(np.inf)
@@ -475,7 +475,7 @@ class ConstrainedSearch(AnytimeSearch):
         return self.context.keeps_constraints(q) and super().keeps_clearance(q)
 
     def simplified(self, path: Configurations) -> Configurations:
-        """A path that keeps the constraints after simplification."""
+        """The path, simplified such that it still keeps the constraints."""
         if not self._shortens:
             return path
         return self._code.simplify(
@@ -516,7 +516,7 @@ class _Validation:
         self._path: ndarray | None = None
         self._shortest: PlanResult | None = None
         """Result of `_path`, the last path of the search that passed validation."""
-        self._timed = list[ndarray]()
+        self._validated = list[ndarray]()
         """The paths of the search that were validated, whether they passed or not."""
         self._validated_at = 0
         self._late = False
@@ -576,7 +576,7 @@ class _Validation:
             return
         if motions is None:
             for path, stage in reversed(search.history if self.context.problem.constraints else ()):
-                if self.context.remaining > 0 and not any(path is timed for timed in self._timed):
+                if self.context.remaining > 0 and not any(path is done for done in self._validated):
                     self._accepts(path, stage)
             return
         self.best = None
@@ -594,7 +594,7 @@ class _Validation:
             self._keep(before)
 
     def _accepts(self, path: ndarray, stage: str) -> bool:
-        self._timed.append(path)
+        self._validated.append(path)
         # If covering spheres collide at the start or goal, the search begins or ends nearby, where they do
         # not: at a lead, see `StartGoal`. The direct way, without the lead, is tried first, since the meshes
         # may be free there.
