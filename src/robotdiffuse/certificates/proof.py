@@ -120,7 +120,7 @@ class MotionProof:
     request_parts: dict[str, str] = field(default_factory=dict)
     """Content hashes of moving obstacles, path constraints and payload, by name."""
     moving: StretchProof | None = None
-    """Proof among moving obstacles; None without such obstacles."""
+    """The proof that the arm collides with no moving obstacle; None without such obstacles."""
     constraints: tuple[tuple[str, float], ...] = ()
     """Name of each quantity that a path constraint limits, and its upper bound along the whole motion [m] or
     [rad]."""

@@ -172,7 +172,7 @@ def run_ablation(
 
     Raises InputError for an unknown row, listing the known ones, for data of another robot, and if `out` is
     the folder of the data, is used by another process, cannot be written, or holds networks that were trained
-    with other numbers of samples or on different data.
+    with other numbers of samples, or networks whose data differ from each other.
     """
     for name in rows:
         check_name("row of Table 2", name, ROWS)

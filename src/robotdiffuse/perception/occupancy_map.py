@@ -293,8 +293,9 @@ class OccupancyMap:
 
     Voxels that a view sees through are free, and voxels that contain its points are occupied. Noisy images
     are filtered first, so that stray pixels have no effect. Points of the arm and of the objects that it
-    holds are ignored, and so are pixels without a return, except where nothing seems to be within the range
-    that the view states. If views contradict each other, the sum of their evidence decides (see HIT).
+    holds are ignored. So are pixels without a return, except in large regions at the border of the image if
+    the view states a range: there, nothing seems to be within this range (see `DepthView.range`). If views
+    contradict each other, the sum of their evidence decides (see HIT).
 
     The voxels are those of `MAP`.
     """
