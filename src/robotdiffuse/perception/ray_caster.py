@@ -8,6 +8,7 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene
+from robotdiffuse.collision.kernels.collision_cost import solid_distance
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import HALF, ONE, TINY, ZERO, kernel
 from robotdiffuse.core.transforms import transform
@@ -180,24 +181,14 @@ def fill_voxels(solids, low, voxel, margin, out):
         for axis in range(3):
             first[axis] = int(max((row[axis] - reach - low[axis]) / voxel, ZERO))
             end[axis] = min(int((row[axis] + reach - low[axis]) / voxel + 1), out.shape[axis])
-        square = (margin + row[15]) ** 2
         for i in range(first[0], end[0]):
-            px = low[0] + (np.float32(i) + HALF) * voxel - row[0]
+            x = low[0] + (np.float32(i) + HALF) * voxel
             for j in range(first[1], end[1]):
-                py = low[1] + (np.float32(j) + HALF) * voxel - row[1]
+                y = low[1] + (np.float32(j) + HALF) * voxel
                 for k in range(first[2], end[2]):
-                    pz = low[2] + (np.float32(k) + HALF) * voxel - row[2]
-                    # how far the center is outside the half edges, along each axis of the solid
-                    x = abs(row[3] * px + row[4] * py + row[5] * pz)
-                    y = abs(row[6] * px + row[7] * py + row[8] * pz)
-                    z = abs(row[9] * px + row[10] * py + row[11] * pz)
-                    if row[16] > ZERO:
-                        x = np.sqrt(x * x + y * y)
-                        y = ZERO
-                    x = max(x - row[12], ZERO)
-                    y = max(y - row[13], ZERO)
-                    z = max(z - row[14], ZERO)
-                    if x * x + y * y + z * z <= square:
+                    z = low[2] + (np.float32(k) + HALF) * voxel
+                    distance, _ = solid_distance(row, (x, y, z))
+                    if distance <= margin:
                         out[i, j, k] = True
 
 
