@@ -175,8 +175,9 @@ UNGUIDED_SAMPLE = ":samples=1:guidance_steps=0:repeat=false"
 (losses of joints, points and collision)."""
 NO_WEIGHTS = (
     f"The row {AS_IN_PAPER!r} is missing, since --paper-weights is not given. No weights of the paper's size "
-    "are bundled: train them (robotdiffuse train planner --config paper --data FOLDER --encoder FOLDER --out "
-    "FOLDER) and give their folder."
+    "are bundled: make them in the repository (python benchmarks/paper_weights/checkpoint.py weights FOLDER) "
+    "or train them (robotdiffuse train planner --config paper --data FOLDER --encoder FOLDER --out FOLDER), "
+    "and give their folder."
 )
 PAPER_METHOD = "RobotDiffuse"
 """Name of the row of the paper's own method in its Table 1."""
