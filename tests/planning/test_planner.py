@@ -73,6 +73,12 @@ def test_weights_are_for_learned_planners_alone(name: str) -> None:
         rd.load_planner(name, weights="nowhere").plan(rd.Problem(PANDA, rd.Scene([]), HOME, GOAL))
 
 
+def test_weights_join_other_settings() -> None:
+    settings = rd.load_planner("diffusion", {"samples": 1}, "panda_points").settings
+    assert (settings.samples, settings.weights) == (1, "panda_points")
+    refuses("weights twice", rd.load_planner, "diffusion", {"weights": "panda_points"}, "panda_points")
+
+
 def test_plan_takes_the_fields_of_a_request() -> None:
     request = [(field.name, field.default) for field in fields(PlanRequest)]
     arguments = list(inspect.signature(rd.plan).parameters.values())

@@ -141,16 +141,16 @@ def load_planner(name: str, settings: object | None = None, weights: str | None 
         name: A name that `robotdiffuse planner list` shows.
         settings: The settings that differ from the defaults, such as {"range": 0.5}, or the planner's own
             dataclass.
-        weights: Folder with weights for a learned planner, in place of the bundled weights. If you also give
-            settings, set their field `weights` instead.
+        weights: Folder with weights for a learned planner, in place of the bundled weights; the same as its
+            setting `weights`.
 
     Returns:
         The planner; its `plan` takes the arguments of `rd.plan`.
 
     Raises:
         InputError: For an unknown name, settings that are unknown, out of bounds or those of another planner,
-            settings together with weights, weights that cannot be read, and weights for a planner without a
-            network.
+            weights that cannot be read, weights for a planner without a network, and weights that are given
+            twice.
 
     Examples:
         >>> planner = rd.load_planner("rrt_connect", {"range": 0.5})
@@ -158,15 +158,17 @@ def load_planner(name: str, settings: object | None = None, weights: str | None 
         >>> planner.plan(problem, until="first").solved
         True
     """
+    if isinstance(settings, Mapping):
+        settings = _default_settings(name).replaced(settings)
     if weights is not None:
-        if settings is not None:
-            raise InputError(f"planner {name} got settings and weights; name the weights in the settings")
         if PLANNERS.entry(name).kind == SEARCH:
             learned = ", ".join(candidate for candidate, entry in PLANNERS.items() if entry.kind != SEARCH)
             raise InputError(f"planner {name} has no weights; planners with weights: {learned}")
-        settings = {"weights": str(file_name(weights, "weights"))}
-    if isinstance(settings, Mapping):
-        settings = _default_settings(name).replaced(settings)
+        chosen = _default_settings(name) if settings is None else PLANNERS.make(name, settings).settings
+        given = getattr(chosen, "weights", None)
+        if given is not None:
+            raise InputError(f"planner {name} got weights twice: {weights}, and in the settings {given}")
+        settings = chosen.replaced({"weights": str(file_name(weights, "weights"))})
     return PLANNERS.make(name, settings)
 
 
