@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.transforms import inverse, placed, scaled_normals, transform
+from robotdiffuse.core.transforms import inverse, placed, transform
 from robotdiffuse.core.types import Points, Pose, frozen_dataclass
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.robots.robot import Robot
@@ -82,34 +82,21 @@ def painted(color: Color, count: int) -> Points:
 def creased(vertices: Points, faces: Int[ndarray, "f 3"], colors: Float[ndarray, "f 3"]) -> Surface:
     """A surface that is shaded smoothly except across sharp edges (CREASE_ANGLE), where vertices are
     duplicated so that each side has a normal of its own. colors: a color per face, 0 to 1."""
-    triangles = vertices[faces]
-    # normals of the faces: the length of `scaled` is twice the face's area, that of `unit` is 1
-    scaled = scaled_normals(triangles)
-    unit = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-12)
-    # the corners of all faces, sorted by their vertex (`owner`)
-    corner = np.argsort(faces.reshape(-1), kind="stable")
-    owner = faces.reshape(-1)[corner]
-    counts = np.bincount(owner, minlength=len(vertices))
-    first = np.cumsum(counts) - counts
-    # all pairs of corners that share a vertex: `mine` and `partner`, as indices of the sorted corners
-    repeats = counts[owner]
-    mine = np.repeat(np.arange(len(owner)), repeats)
-    within = np.arange(len(mine)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
-    partner = first[owner[mine]] + within
-    face = corner // 3
-    # normal of a corner: sum over the faces at its vertex that make a smooth edge with its own face
-    alike = np.einsum("ij,ij->i", unit[face[mine]], unit[face[partner]]) > np.cos(CREASE_ANGLE)
-    summed = [
-        np.bincount(mine[alike], scaled[face[partner[alike]], i], minlength=len(owner)) for i in range(3)
-    ]
-    normals = np.stack(summed, axis=1).astype(np.float64)  # bincount of no corners gives integers
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    # corners with the same vertex, normal and color become one vertex of the surface
-    keys = np.column_stack([owner, np.round(normals * 100), np.round(colors[face] * 255)]).astype(np.int64)
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    smooth = mesh.face_adjacency[mesh.face_adjacency_angles < CREASE_ANGLE]
+    patches = trimesh.graph.connected_component_labels(smooth, len(faces))
+    owner = faces.reshape(-1)
+    # each patch gets its own copy of its vertices, with the normals of this patch alone
+    copies, copy = np.unique(np.column_stack([owner, np.repeat(patches, 3)]), axis=0, return_inverse=True)
+    patched = trimesh.Trimesh(vertices[copies[:, 0]], copy.reshape(-1, 3), process=False)
+    # a vertex where faces of several colors meet is duplicated too, with the same normal
+    colors_of_corners = np.round(np.repeat(colors, 3, axis=0) * 255)
+    keys = np.column_stack([copy.reshape(-1), colors_of_corners])
     _, keep, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    split = np.empty(3 * len(faces), np.int64)
-    split[corner] = index.reshape(-1)
-    return Surface(vertices[owner[keep]], normals[keep], colors[face[keep]], split.reshape(-1, 3))
+    normals = patched.vertex_normals[copy.reshape(-1)[keep]]
+    return Surface(vertices[owner[keep]], normals, colors[keep // 3], index.reshape(-1, 3))
 
 
 def link_surfaces(robot: Robot) -> dict[str, Surface]:
