@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import cache
-from inspect import unwrap
 
 import numpy as np
 import pytest
@@ -116,19 +115,13 @@ def test_what_appears_in_space_that_was_often_seen_free_is_there_at_once() -> No
     assert MAP.hold(known.occupied, front).mean() > 0.9
     assert MAP.hold(known.stale, behind).mean() > 0.9 and not MAP.hold(known.free, behind).any(), "only its front is seen"
     assert (before & ~known.free & ~true(0.06)).sum() < 1e-3 * before.sum()
-    known.add_points(np.array([[0.3, -0.5, 0.4]]))
-    assert MAP.hold(known.occupied, np.array([[0.3, -0.5, 0.4]])).all(), "points without a sensor too"
     known.add(view_from(2.8, scene=rd.Scene([FLOOR])))
     assert MAP.hold(known.stale, behind).mean() < 0.1, "the arm hides some"
 
 
-def test_points_and_free_zones() -> None:
+def test_free_zones() -> None:
     known = OccupancyMap(PANDA)
     known.declare_free(((-0.3, -0.3, 0.0), (0.3, 0.3, 0.7)))
     assert known.free.sum() == 30 * 30 * 35
-    known.add_points(np.array([[0.01, 0.01, 0.01], [9.0, 0.0, 0.0]]))
-    assert known.occupied.sum() == 1 and known.free.sum() == 30 * 30 * 35 - 1
-    for stamp in (None, "a", np.nan):  # regressions: a raw TypeError, and points that max_age lost
-        refuses("stamp is", unwrap(OccupancyMap.add_points), known, np.zeros((1, 3)), stamp)
     refuses("free_zone is", known.declare_free, ((0.3, 0.0, 0.0), (0.1, 1.0, 1.0)))
     refuses(r"view\.configuration is None; a map needs", known.add, replace(view_from(0.0), configuration=None))

@@ -19,13 +19,11 @@ from robotdiffuse.collision.kernel_arrays import reach_bound
 from robotdiffuse.core import errors
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.locked import locked
-from robotdiffuse.core.settings import Number, converted
 from robotdiffuse.core.types import Configuration, Path, Points, Spheres, Values, frozen_dataclass
 from robotdiffuse.perception.depth_filter import PointErrors, filtered, point_errors, wide_regions
 from robotdiffuse.perception.depth_view import AssumedPoints, DepthView
 from robotdiffuse.perception.observed_volume import (
     FREE,
-    HIDDEN,
     ObservedVolume,
     add_evidence,
     carve_view,
@@ -351,20 +349,6 @@ class OccupancyMap:
                 f" {self.robot.name} when the view was taken"
             )
         return q
-
-    @locked
-    def add_points(self, points: Points, stamp: float = 0.0) -> None:
-        """Take occupied points in the base frame into account [m], e.g. the points of an
-        `rd.PointCloud.from_file`. They give no information about free space. Raises InputError for anything
-        but n x 3 numbers."""
-        at = MAP.indices(errors.points("map", "points", points))
-        stamp = converted("stamp", Number, stamp)
-        at = at[MAP.contains(at)]
-        if stamp < self.oldest:  # already forgotten
-            return
-        counts = np.zeros(MAP.shape, np.int32)
-        counts[tuple(at.T)] = 1
-        self._update(np.full(MAP.shape, HIDDEN, np.uint8), counts, stamp)
 
     @locked
     def declare_free(self, zone: Corners) -> None:
