@@ -210,7 +210,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
     def _shuffled(self, generator: torch.Generator) -> ndarray:
         """A random order of the items: blocks of shards in random order, each with its items shuffled."""
         shard = self._places[:, 0]
-        # items are sorted by shard: the first item of each shard, and the number of items
+        # items are sorted by shard; `first`: index of each shard's first item, then the number of items
         first = np.searchsorted(shard, np.arange(len(self._trajectories) + 1)).tolist()
         shards = torch.randperm(len(self._trajectories), generator=generator).tolist()
         blocks = [np.zeros(0, np.int64)]

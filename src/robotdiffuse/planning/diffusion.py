@@ -121,7 +121,7 @@ class Diffusion(ExportedPlanner[DiffusionSettings]):
         """See `planning.planner.Planner`."""
         model = self.network(context.problem.robot)
         rng = context.rng
-        start, goals = start_goal.leads()  # free; `complete` adds the true start and goal
+        start, goals = start_goal.leads()  # collision-free; `complete` adds the true start and goal
         embedding = encode(model, start_goal.checker, self.settings.points, rng)
         names = context.problem.robot.joint_names
         constraints = context.validator.constraints

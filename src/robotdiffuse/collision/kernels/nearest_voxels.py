@@ -8,8 +8,7 @@ from robotdiffuse.core.kernels import allocation_free, kernel
 # Squared distance that stands for infinity, in lines without any points [voxels²]
 _NO_POINTS = np.int32(1 << 30)
 # Added before a position along a line is rounded down [voxels]. It is more than the rounding error. Positions
-# are fractions with small denominators, so those that are not integers are farther than this below the next
-# integer.
+# are fractions with small denominators; the next integer above a fraction is farther away than this.
 _ROUNDING_SLACK = 1e-6
 
 
@@ -18,9 +17,9 @@ def nearest_voxels(run):
     """For each voxel the squared distance to the nearest voxel with points [voxels²], and the value of `run`
     at this nearest voxel.
 
-    run int32[nx, ny, nz] is the index of the voxel's run (its consecutive points), -1 without points; at
-    least one voxel has points. The transform goes axis by axis (A. Meijster, J. Roerdink, W. Hesselink,
-    2000).
+    run int32[nx, ny, nz] is the index of the voxel's run: its points, which follow each other in the list of
+    all points. It is -1 without points; at least one voxel has points. The transform goes axis by axis
+    (A. Meijster, J. Roerdink, W. Hesselink, 2000).
     """
     nx, ny, nz = run.shape
     # along z: a scan in both directions; then along y and x: lower envelopes of parabolas

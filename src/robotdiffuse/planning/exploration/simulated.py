@@ -152,7 +152,8 @@ UNSUPPORTED = (
     "waypoints", "constraints", "moving", "payload", "start_velocity", "views", "unknown", "clearance"
 )  # fmt: skip
 """Fields of problems that an Explorer does not take into account."""
-# Time between images during a motion [s], and largest number of images per motion, with the last one.
+# Smallest time between images during a motion [s], and largest number of images per motion, including the one
+# at its end.
 IMAGE_PERIOD = 0.25
 MAX_IMAGES = 8
 

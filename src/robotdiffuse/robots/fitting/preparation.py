@@ -186,7 +186,7 @@ class PreparationSettings:
     rounds: int = 2
     """Largest number of rounds of refinement."""
     finest: float = 0.002
-    """Smallest tolerance of spheres [m]."""
+    """Smallest tolerance of spheres at the places that refinement makes tight [m]."""
 
     def for_reach(self, reach: float) -> "PreparationSettings":
         """The settings with their lengths scaled for an arm with a reach [m]."""
@@ -338,8 +338,8 @@ def _refined(
     """The robot with finer parts and spheres, or with tables, for pairs of links with many false collisions;
     `k` is the number of refinements before."""
     worst_pairs = _worst(false_collisions, settings.max_false_collisions)
-    # A table replaces the spheres of its pair and is computed from the pair's parts. So only where parts
-    # collide falsely, at the places in `coarse`, do they need to be finer.
+    # A table replaces the spheres of its pair. It is computed from the pair's parts, so these need to be
+    # finer only where they collide falsely: at the places in `coarse`.
     table_pairs = {pair.links for pair in worst_pairs if _beyond_spheres(robot, pair, settings, k)}
     coarse_links = {
         name
@@ -477,7 +477,7 @@ MAX_PROPOSED = 3
 although no single pair always collides."""
 ASSUMED_SAFE = {
     "default": "also with all joints between them at zero: the meshes are assumed to be too large",
-    "limits": "in a range of one joint up to its limit, where the links are assumed to meet",
+    "limits": "in a range of one joint up to its limit: its stop is assumed to be where the links meet",
     "pose": "also in a pose that the SRDF names: the meshes are assumed to be too large",
 }
 """Reasons for allowing a pair that a person should check, each with an explanation for the warning."""
@@ -596,8 +596,8 @@ def add_robot(
         seed: The same input and seed give the same robot.
         progress: Called at each step.
         srdf: Source of groups, poses and passive joints; by default the SRDF found beside the URDF, or the
-            keyframes and exclusions of a MuJoCo model. An SRDF that is given here and a MuJoCo model also
-            allow pairs of links, which are then not checked; an SRDF that was found does not. The report
+            keyframes and exclusions of a MuJoCo model. If it is given here or is a MuJoCo model, it also
+            allows pairs of links, which are then not checked; an SRDF that was found does not. The report
             lists where sampling and this source differ.
         allow: Further pairs of links that are not checked.
         packages: Folders of ROS packages by name.

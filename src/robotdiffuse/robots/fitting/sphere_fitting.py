@@ -494,8 +494,9 @@ def _without_holes(solid: Solid, inside: Points, spheres: Spheres) -> Spheres:
     could hide."""
     depth = solid.inscribed_sizes().at(inside)
     gap = gaps(inside, spheres)
-    # Every point is within `half`, half the diagonal of a grid cell, of a grid point. Therefore a sphere must
-    # contain the ball of this radius around a grid point deep in the solid; elsewhere, just the grid point.
+    # No point is farther from the nearest grid point than `half`, half the diagonal of a grid cell. So a
+    # sphere must contain the ball of this radius around a grid point deep in the solid; elsewhere, just the
+    # grid point.
     half = np.sqrt(0.75) * solid.spacing
     is_open = gap > np.where(depth > 2 * half, -half, 0.0)
     inside = inside[is_open]
