@@ -54,7 +54,7 @@ def end() -> None:
 
 
 def compiles(name: str) -> None:
-    """Note that this thread compiles a function: the whole block of `loading` around it is compile time."""
+    """Record that this thread compiles a function: the whole block of `loading` is then compile time."""
     global on_first_compilation
     _clock.compiles = True
     compiled.append(name)

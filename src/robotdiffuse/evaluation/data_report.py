@@ -35,7 +35,7 @@ SPREAD = {"least": 0.0, "5 %": 0.05, "median": 0.5, "95 %": 0.95, "most": 1.0}
 """Quantiles of each quantity over the motions."""
 SAMPLED_MOTIONS = 20_000
 """ARRAYS_OF_SAMPLE are read for every k-th motion only, with the largest k that gives at least this many
-motions of a complete data set. If the data set has fewer motions, all are read."""
+motions of a complete data set. If fewer motions are planned than this, k is 1."""
 SAMPLED_WAYPOINTS = 24
 """Number of waypoints that are read of each of these motions, spread evenly."""
 ARRAYS_OF_ALL = ("cost", "clearance", "end_clearance", "safety_distance", "line_free", "detour", "family")

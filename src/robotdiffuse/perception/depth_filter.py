@@ -274,11 +274,11 @@ def empty_regions(depth: DepthImage, reach: float | None = None, arm: Pixels | N
 
 
 GRAZED_WIDTH = 0.04
-"""A board that is seen almost edge-on gives no return, as open space does. So pixels without a return that
-are this near to a surface in the image do not show that the space behind the surface is open [m]. Pixels are
-converted to meters at the surface's depth."""
+"""Width of the border around a surface in the image [m, at the surface's depth]. Pixels without a return in
+this border do not show that the space beyond the surface is open: a board that is seen almost edge-on gives
+no return either."""
 DEPTH_FACTOR = 1.5
-"""Surfaces whose depths differ by less than this factor are widened by the same number of pixels."""
+"""Surfaces whose depths differ by less than this factor get a border of the same number of pixels."""
 
 
 def open_depth(depth: DepthImage, arm: Pixels, focal: float) -> DepthImage:

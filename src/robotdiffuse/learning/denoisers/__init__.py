@@ -84,12 +84,12 @@ class EncoderDecoderSettings(AttentionSettings, name="encoder_decoder"):
     """Size of a token; even."""
     layers: Count = 4
     """Number of blocks of the decoder."""
-    encoder_layers: Count = 2
-    """Number of blocks of the encoder."""
     heads: Count = 4
     """Number of attention heads; a divisor of `width`."""
     hidden: Count = 432
     """Size of the hidden layer of each feed-forward network."""
+    encoder_layers: Count = 2
+    """Number of blocks of the encoder."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ class EncoderSettings(Settings, name="encoder"):
     """Points outside this region are ignored, since the arm does not reach them."""
 
     def prepared(self, points: Float32[ndarray, "n 3"]) -> Float32[ndarray, "m 3"]:
-        """The points, all of them within the region, in the form that the exported encoder takes [m]."""
+        """The points, which must be in the region, in the form that the exported encoder takes [m]."""
         if self.ordered:
             return in_order(points, self.cloud)
         # padding points of zeros have no effect; the exported network needs at least one point, and without
@@ -118,7 +118,7 @@ class PointsSettings(EncoderSettings, name="points"):
 
 @dataclass(frozen=True)
 class PointNetSettings(EncoderSettings):
-    """Sizes for training on a CPU; the original's are in brackets."""
+    """Sizes for training on a CPU; the original's are in parentheses."""
 
     cloud: Count = 256
     """Number of points of an input cloud (in the paper of the encoder: 1024)."""
@@ -136,7 +136,7 @@ class PointNetSettings(EncoderSettings):
 
 @dataclass(frozen=True)
 class DGCNNSettings(EncoderSettings):
-    """Sizes for training on a CPU; the original's are in brackets."""
+    """Sizes for training on a CPU; the original's are in parentheses."""
 
     any_size = False  # distances to neighbors depend on the density of the cloud
     cloud: Count = 128
