@@ -317,7 +317,7 @@ def test_a_base_that_is_moved_leaves_obstacles_in_the_world() -> None:
     assert np.allclose(space.ik(space.pose(GOAL), near=GOAL)[0], GOAL, atol=1e-3)
     space.add(rd.Sphere(space.pose(GOAL)[:3, 3], 0.01, name="pea"))
     space.attach("pea", GOAL)
-    refuses("a shape is named pea, as an object that the robot holds", space.add, rd.Sphere([1, 1, 1], 0.1, "pea"))
+    refuses("a shape is named pea, like an object the robot holds", space.add, rd.Sphere([1, 1, 1], 0.1, "pea"))
     space.allow("ball", ["pea", "panda_hand"])
     space.detach("pea", GOAL)
     assert space.scene.allowed_contacts == (("ball", ("panda_hand",)),) and space.is_free("ready")

@@ -243,7 +243,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         margins[SCENE] = min(margins[SCENE], *moving_margins.values())
     record = None
     with suppress(InputError):  # the robot may have been made or changed in this program, and have no file
-        # with T_world_base, the record's numbers would be rounded; only a payload's weight depends on it
+        # without T_world_base, numbers are not rounded; only a payload's weight depends on this pose
         record = problem_record(problem if problem.payload else replace(problem, T_world_base=None))
     jerks = cubic_jerks(robot, motion)
     return Certificate(

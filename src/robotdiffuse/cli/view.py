@@ -102,8 +102,8 @@ def run_view(arguments: Namespace) -> None:
 
 def _read_several(files: list[str]) -> tuple[Problem, dict[str, PlanResult]]:
     """The problem of the first of several result files, and the solved results by the names of the files.
-    Raises InputError as `read_solved` does, if the results are for different robots, bases, scenes or moving
-    obstacles, and if two names are equal."""
+    Raises InputError as `read_solved` does, and if two names are equal or the results are for different
+    robots, bases, scenes or moving obstacles."""
 
     names = [Path(file).stem for file in files]
     (result, problem), *further_results = map(read_solved, files)

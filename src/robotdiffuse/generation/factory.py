@@ -72,7 +72,7 @@ SEARCHES = Registry(
         ),
         "aorrtc": Entry(
             "robotdiffuse.generation.aorrtc_solver:AORRTCSearch",
-            "shorter paths in less time at the same safety distance; stores the cost of one goal",
+            "equally short paths in less time; stores the cost of one goal",
             "AORRTCSearchSettings",
         ),
     },

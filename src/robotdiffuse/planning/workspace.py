@@ -247,7 +247,7 @@ class Workspace:
             T_world_base: Pose of the robot's base [4, 4]; None: the base is at the origin of the world.
 
         Raises:
-            InputError: For anything but a robot, an unknown link, and a pose that is not rigid.
+            InputError: For an unknown link, a pose that is not rigid, and anything but a robot.
         """
         check_robot(robot)
         self.robot = robot
@@ -285,8 +285,8 @@ class Workspace:
             shapes: Shapes, meshes or point clouds with different names, in the frame of the world.
 
         Raises:
-            InputError: For anything but shapes, two shapes with equal names, and a shape with the name of a
-                held object.
+            InputError: For two shapes with equal names, a shape with the name of a held object, and anything
+                but shapes.
         """
         for i, shape in enumerate(shapes):
             check_type(f"shapes[{i}]", shape, Shape, "a shape, each an argument of its own")
@@ -294,9 +294,7 @@ class Workspace:
         names = [shape.name for shape in new]
         for body in self.robot.attached:
             if body.name in names:
-                raise InputError(
-                    f"a shape is named {body.name}, as an object that the robot holds; rename it"
-                )
+                raise InputError(f"a shape is named {body.name}, like an object the robot holds; rename it")
         if names != [shape.name for shape in shapes]:
             raise InputError(
                 f"shapes are named {', '.join(shape.name for shape in shapes)}; names must differ"
@@ -382,7 +380,7 @@ class Workspace:
         scene, robot = self.scene.detach(name, self.robot, self._configuration(q))
         shared = {shape.name for shape in scene.shapes} & {body.name for body in robot.attached}
         if shared:
-            raise InputError(f"a shape of {name} is named {min(shared)}, as an object that the robot holds")
+            raise InputError(f"a shape of {name} is named {min(shared)}, like an object the robot holds")
         self.scene, self.robot = scene, robot
         self.tip = self.robot.tip if self.tip == name else self.tip
 
@@ -494,8 +492,8 @@ class Workspace:
             A result with a verified motion for each step, or with the step that failed and the reason.
 
         Raises:
-            InputError: For a step with wrong input (the message names the step), for anything but a list of
-                steps, a wrong start, and what `rd.plan` does not accept.
+            InputError: For a step with wrong input (the message names the step), a wrong start, what
+                `rd.plan` does not accept, and anything but a list of steps.
 
         Examples:
             >>> space = rd.Workspace(rd.load_robot("panda"))

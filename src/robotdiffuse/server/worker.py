@@ -214,8 +214,10 @@ ARGUMENTS = ("planner", "rate", *CALL_ARGUMENTS)
 def _resampled(problem: Problem, trajectory: Trajectory, rate: float) -> tuple[Trajectory, Report]:
     """The motion with rows at `rate` [Hz], and its report. Raises InputError if the validator rejects it."""
     if trajectory.duration * rate > MAX_ANSWER_ROWS:
-        rows = f"for {trajectory.duration:.3g} s; an answer may have {MAX_ANSWER_ROWS} rows"
-        raise InputError(f"rate is {rate:g} Hz {rows}")
+        duration = trajectory.duration
+        raise InputError(
+            f"rate is {rate:g} Hz for {duration:.3g} s; an answer may have {MAX_ANSWER_ROWS} rows"
+        )
     rows = trajectory.resample(rate)
     report = Verifier(problem).trajectory(rows)
     if not report.valid:

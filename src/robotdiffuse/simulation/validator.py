@@ -38,7 +38,7 @@ class PyBulletOracle(World):
     """A collision checker with a PyBullet world of its own, without a window.
 
     Links that no planned joint moves are checked only against moving links. Call `close`, or use it in a
-    `with` statement. `set_scene` replaces the obstacles; the robot stays loaded, so it is a thousand times
+    `with` statement. `set_scene` replaces the obstacles and keeps the robot loaded, which is a thousand times
     faster than a new oracle.
     """
 

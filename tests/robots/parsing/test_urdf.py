@@ -292,7 +292,8 @@ def test_a_robot_whose_srdf_changed_is_to_be_made_again(given: bool, tmp_path: P
 def test_names_by_which_an_added_robot_could_not_be_loaded_are_refused(name: str, tmp_path: Path) -> None:
     """Regression: the bundled panda was used in place of an added robot with this name."""
     file = written(tmp_path, chain("base", ["j"]))
-    refuses(r".*not that of a file or a bundled robot: give --name NAME", add_robot, file, name=name, settings=QUICK)
+    message = r".*without a file ending, and not that of a bundled robot: give --name NAME"
+    refuses(message, add_robot, file, name=name, settings=QUICK)
 
 
 @pytest.mark.parametrize(

@@ -35,8 +35,7 @@ class EncoderSettings(Settings, name="encoder"):
         """The points, which must be in the region, in the form that the exported encoder takes [m]."""
         if self.ordered:
             return in_order(points, self.cloud)
-        # padding points of zeros have no effect; the exported network needs at least one point, and without
-        # `any_size` it needs `cloud` points
+        # the exported network needs `cloud` points, with `any_size` at least one; zeros have no effect
         needed = 1 if self.any_size else self.cloud
         return np.pad(points, ((0, max(needed - len(points), 0)), (0, 0)))
 

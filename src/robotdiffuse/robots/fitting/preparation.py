@@ -620,8 +620,8 @@ def add_robot(
     ambiguous = out is None and (name in ROBOTS or name.lower().endswith(FILE_ENDINGS) or "\\" in name)
     if ambiguous or Path(name).name != name or name.startswith(".") or not name.isprintable():
         raise InputError(
-            f"robot name is {name!r}; it must be a valid folder name, but not that of a file or a "
-            f"bundled robot: give --name NAME"
+            f"robot name is {name!r}; it must be a valid folder name without a file ending, and not that of "
+            f"a bundled robot: give --name NAME"
         )
     folder = user_robots() / name if out is None else Path(out)
     with lock_folder(folder):  # fails early if the folder cannot be written
