@@ -12,6 +12,7 @@ import trimesh
 import robotdiffuse as rd
 from helpers.refusals import refuses
 from robotdiffuse.adapters.mplib import Planner, Pose, matrix
+from robotdiffuse.robots import ROBOTS, known_robots
 from robotdiffuse.robots.kinematic_tree import Mimic
 
 JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
@@ -74,10 +75,12 @@ def test_both_versions_and_objects_with_p_and_q(made: Planner) -> None:
 
 
 def test_arguments_of_both_versions(made: Planner) -> None:
-    """Regressions: a screw took no arguments of 0.2, and ignored time_step by position; return_closest, None, [] were wrong."""
+    """Regressions: a screw took no arguments of 0.2; time_step by position failed; return_closest, None, [] were wrong."""
     for result in (made.plan_screw(POSE, QPOS, 0.1, 0.05), made.plan_screw(target_pose=POSE, qpos=QPOS, time_step=0.05)):
         assert np.allclose(result["time"][:2], [0.05, 0.1])
     assert made.plan_screw(goal_pose=POSE, current_qpos=QPOS, wrt_world=True, verbose=False)["status"] == "Success"
+    for result in (made.plan_qpos_to_pose(POSE, QPOS, [], 0.05, 0.1, 5.0), made.plan_qpos_to_qpos([QPOS], QPOS, 0.05)):
+        assert np.allclose(result["time"][:2], [0.05, 0.1])
     assert made.plan_qpos([QPOS], QPOS, fixed_joint_indices=[], constraint_function=None)["status"] == "Success"
     _, closest = made.IK(POSE, QPOS, return_closest=True)
     assert isinstance(closest, np.ndarray) and closest.shape == (9,)
@@ -141,10 +144,10 @@ def test_bad_input(tmp_path: Path) -> None:
     refuses("qpos: locked: panda_finger_joint1 is 0.2", planner().plan_qpos, [QPOS], [*QPOS[:7], 0.2, 0.2])
     refuses("unknown option 'tim_step'.*did you mean time_step", planner().plan_pose, [0.5, 0, 0.4, *DOWN], QPOS, tim_step=1)
     for call, goal in ((planner().plan_pose, POSE), (planner().plan_screw, POSE), (planner().plan_qpos, [QPOS])):
-        refuses("planning_time is -1; it must be a number from", call, goal, QPOS, planning_time=-1)
+        refuses("planning_time is -1.0; it must be a number from", call, goal, QPOS, planning_time=-1.0)
     refuses("unknown option 'constraint_function'", planner().plan_qpos, [QPOS], QPOS, constraint_function=print)
     refuses("unknown option 'fixed_joint_indices'", planner().plan_qpos, [QPOS], QPOS, fixed_joint_indices=[0])
-    refuses("time_step is 0; it must be", planner().plan_pose, [0.5, 0, 0.4, *DOWN], QPOS, time_step=0)
+    refuses("time_step is 0.0; it must be", planner().plan_pose, [0.5, 0, 0.4, *DOWN], QPOS, time_step=0.0)
     refuses("goal_qposes is .*; it must be rows of 9 numbers", planner().plan_qpos, [QPOS, QPOS[:3]], QPOS)
     refuses("n_init_qpos: .*count is 0; it must be an integer", planner().IK, [0.5, 0, 0.4, *DOWN], QPOS, n_init_qpos=0)
     refuses("radius is -1.0; it must be a number", planner().update_point_cloud, [[1, 1, 1]], -1.0)
@@ -226,8 +229,8 @@ def test_a_mask_may_hold_joints_that_are_not_planned_only(made: Planner) -> None
 
 def test_a_robot_is_prepared_again_if_its_meshes_or_srdf_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Regression: only the URDF, the SRDF given and the move group were compared with those that had been prepared."""
-    robots = tmp_path / "robots"
-    monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(robots))
+    monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
+    robots = tmp_path / "robots" / "mplib"
     cube = trimesh.creation.box([0.1, 0.1, 0.2])
     cube.export(tmp_path / "arm.stl")
     link = "<collision><geometry><mesh filename='arm.stl'/></geometry></collision>"
@@ -245,6 +248,10 @@ def test_a_robot_is_prepared_again_if_its_meshes_or_srdf_change(tmp_path: Path, 
     made = Planner(urdf, "tool")
     assert len([*robots.iterdir()]) == 3
     assert np.isclose(np.ptp(made.robot.meshes["tool"][0].vertices[:, 2]), 0.3, atol=5e-3)
+    # Regression: load_robot took one of these for the URDF, though it may have another tip and other pairs
+    assert known_robots().keys() == {*ROBOTS}
+    next(robots.iterdir()).rename(tmp_path / "robots" / "mine")
+    assert Planner("mine", "tool").robot.joint_names == made.robot.joint_names
 
 
 def test_where_no_motion_turns_evenly_one_that_turns_otherwise_has_a_note() -> None:

@@ -91,6 +91,12 @@ def test_text_that_is_malformed_nested_too_deep_or_a_bomb(parse: Callable[[Any, 
         assert message in one_line(lambda text=text: parse(text, "it"))
 
 
+def test_comments_of_xml_as_mujoco_and_ros_read_them() -> None:
+    """Regression: rulers of "-" in comments were refused, and comments or blank lines before the declaration."""
+    text = b"\n<!-- ---- arm ---- -->\n<?xml version='1.0'?>\n<a><!-- <b> --><c/><!----><d/></a><!-- x"
+    assert [child.tag for child in files.parse_xml(text, "it")] == ["c", "d"]
+
+
 def test_brackets_in_texts_are_no_nesting() -> None:
     value = ["[" * 500, '\\"{' * 500, {"a": [[1]]}]
     assert files.parse_json(json.dumps(value), "it") == value

@@ -36,7 +36,7 @@ from robotdiffuse.core.types import PlanResult
 from robotdiffuse.planning.workspace import Workspace
 from robotdiffuse.problems.compiled_constraints import pose_difference
 from robotdiffuse.problems.problem import JointGoal
-from robotdiffuse.robots import ROBOTS, load_robot
+from robotdiffuse.robots import known_robots, load_robot
 from robotdiffuse.robots.bodies import RigidShape
 from robotdiffuse.robots.fitting.preparation import add_robot
 from robotdiffuse.robots.parsing.urdf import UrdfTree, with_limits
@@ -93,8 +93,8 @@ class Planner:
     """Plans motions of a robot, as `mplib.Planner` does.
 
     Args:
-        urdf: The robot's URDF, prepared on first use, in about a minute; or the name of a bundled robot, for
-            which `srdf` and `package_keyword_replacement` are ignored.
+        urdf: The robot's URDF, prepared on first use, in about a minute; or the name of a bundled or added
+            robot, for which `srdf` and `package_keyword_replacement` are ignored.
         move_group: The link that goal poses refer to.
         srdf: SRDF with pairs of links that need no check; "" or none: these pairs are found by sampling.
         package_keyword_replacement: The folder that replaces `package://` in the URDF.
@@ -272,7 +272,14 @@ class Planner:
         return f"IK Failed! The pose of {self.workspace.tip} {why}", None
 
     def plan_pose(
-        self, goal_pose: Any, current_qpos: ArrayLike, mask: Any = None, **options: Any
+        self,
+        goal_pose: Any,
+        current_qpos: ArrayLike,
+        mask: Any = None,
+        time_step: float = 0.1,
+        rrt_range: float = 0.1,
+        planning_time: float = 1.0,
+        **options: Any,
     ) -> dict[str, Any]:
         """Plan to a pose of the move group.
 
@@ -281,25 +288,35 @@ class Planner:
             current_qpos: The present joint values, in the order of `user_joint_names`; or only those of the
                 planned joints.
             mask: True for joints that are held; these must not be planned joints.
-            options: `time_step` [s] between rows (0.1), `planning_time` [s] (1), `wrt_world`; other options
-                of MPlib are ignored, and constraints are refused.
+            time_step: Time between rows [s].
+            rrt_range: Ignored.
+            planning_time: Time limit [s].
+            options: `wrt_world`; other options of MPlib are ignored, and constraints are refused.
 
         Returns:
             A dictionary with `status`: "Success", or the reason for the failure. If the plan succeeded, also
             with `time`, `position`, `velocity`, `acceleration`, `duration` and `note`.
         """
         self._check_mask(mask)
-        goal = self._in_world(goal_pose, options)
-        return self._planned("planning failed", partial(self.workspace.plan, goal), current_qpos, options)
+        plan = partial(self.workspace.plan, self._in_world(goal_pose, options))
+        return self._planned("planning failed", plan, current_qpos, time_step, planning_time, options)
 
-    def plan_qpos(self, goal_qposes: Any, current_qpos: ArrayLike, **options: Any) -> dict[str, Any]:
+    def plan_qpos(
+        self,
+        goal_qposes: Any,
+        current_qpos: ArrayLike,
+        time_step: float = 0.1,
+        rrt_range: float = 0.1,
+        planning_time: float = 1.0,
+        **options: Any,
+    ) -> dict[str, Any]:
         """Plan to any of several configurations; see `plan_pose`."""
         goals = np.atleast_2d(_array(goal_qposes))
         if goals.ndim > 2 or goals.shape[1] not in (self.robot.dof, len(self.joint_names)):
             raise InputError(f"goal_qposes is {shown(goal_qposes)}; it must be rows of {self._expected()}")
         ends = goals if goals.shape[1] == self.robot.dof else goals[:, self._places]
         plan = partial(self.workspace.plan, JointGoal(ends))
-        return self._planned("planning failed", plan, current_qpos, options)
+        return self._planned("planning failed", plan, current_qpos, time_step, planning_time, options)
 
     def plan_screw(
         self,
@@ -307,6 +324,8 @@ class Planner:
         current_qpos: ArrayLike = (),
         qpos_step: float = 0.1,
         time_step: float = 0.1,
+        *,
+        planning_time: float = 1.0,
         **options: Any,
     ) -> dict[str, Any]:
         """Move along a straight line while turning at a constant rate; see `plan_pose`.
@@ -319,7 +338,6 @@ class Planner:
         """
         T = self._in_world(options.pop("target_pose", goal_pose), options)
         qpos = options.pop("qpos", current_qpos)
-        options["time_step"] = time_step
 
         def plan(start: ndarray, **request: Any) -> PlanResult:
             result = self.workspace.plan_line(T, start, **request)
@@ -341,7 +359,7 @@ class Planner:
             degrees = np.degrees(angle)
             return noted(tilted, f"the pose is out of reach; the motion ends tilted by {degrees:.1f} degrees")
 
-        return self._planned("screw plan failed", plan, qpos, options)
+        return self._planned("screw plan failed", plan, qpos, time_step, planning_time, options)
 
     plan_qpos_to_pose = plan_pose
     plan_qpos_to_qpos = plan_qpos
@@ -364,7 +382,13 @@ class Planner:
         return self._start(options.get("qpos", options.get("state", unnamed)))
 
     def _planned(
-        self, failed: str, plan: Callable[..., PlanResult], qpos: ArrayLike, options: dict[str, Any]
+        self,
+        failed: str,
+        plan: Callable[..., PlanResult],
+        qpos: ArrayLike,
+        time_step: float,
+        planning_time: float,
+        options: dict[str, Any],
     ) -> dict[str, Any]:
         """A planned motion as MPlib returns it, with a row every `time_step`. The first row is one step after
         the start. The last row is repeated for SETTLING_TIME, since scripts grasp and release right after
@@ -373,10 +397,10 @@ class Planner:
             if value is not None and np.size(value):  # MPlib 0.1: fixed_joint_indices=[]
                 check_name("option", name, OPTIONS)
         start = self._start(qpos)
-        step = positive("options", "time_step", options.get("time_step", 0.1))
+        step = positive("options", "time_step", time_step)
         if step < MIN_TIME_STEP:
             raise InputError(f"time_step is {step}; it must be at least {MIN_TIME_STEP} s")
-        time_limit = positive("options", "planning_time", options.get("planning_time", 1.0))
+        time_limit = positive("options", "planning_time", planning_time)
         try:
             result = plan(start, time_limit=time_limit)
         except InputError as error:
@@ -481,9 +505,9 @@ def matrix(value: Any) -> ndarray:
 
 
 def _robot(urdf: str | Path, tip: str, srdf: str | Path | None, package: str) -> Robot:
-    """The prepared robot. A URDF with new content, or with new meshes, is prepared first, and stored in the
-    user's robots."""
-    if str(urdf) in ROBOTS:
+    """The prepared robot. A URDF with new content, or with new meshes, is prepared first. It is stored where
+    `load_robot` does not look, which may want another tip of the same URDF."""
+    if str(urdf) in known_robots():
         return load_robot(str(urdf))
     packages: dict[str, str | Path] = {}
     if package:
@@ -494,7 +518,7 @@ def _robot(urdf: str | Path, tip: str, srdf: str | Path | None, package: str) ->
     semantics = srdf or tree.srdf
     content = read_bytes(semantics, "srdf") if semantics else b""
     content += f"{tree.digest} {tip} {bool(srdf)}".encode()
-    folder = user_robots() / f"{Path(urdf).stem}-{hashlib.sha256(content).hexdigest()[:8]}"
+    folder = user_robots() / "mplib" / f"{Path(urdf).stem}-{hashlib.sha256(content).hexdigest()[:8]}"
     if not (folder / ROBOT_FILE).is_file():
         add_robot(urdf, tip=tip, srdf=srdf or None, packages=packages, out=folder)
     return load_robot(folder)

@@ -233,11 +233,13 @@ def parse_yaml(text: str, where: str) -> Any:
 
 def parse_xml(text: bytes, where: str) -> ET.Element:
     """The root of an XML text. Raises InputError, naming `where`, if it is not well-formed, too deeply nested
-    or in an unknown encoding."""
+    or in an unknown encoding. As in MuJoCo and ROS, comments may contain "--", and stand before the
+    declaration."""
+    text = re.sub(rb"<!--.*?(-->|\Z)", lambda comment: b"\n" * comment[0].count(b"\n"), text, flags=re.DOTALL)
     depth = 0
     parser = ET.XMLPullParser(("start", "end"))
     try:
-        parser.feed(text)
+        parser.feed(text.lstrip())
         parser.close()
         events: list[Any] = list(parser.read_events())
         for event, _ in events:

@@ -321,6 +321,8 @@ def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
     if model.nflex:
         flex = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, 0)
         raise InputError(f"flex {flex} is soft; obstacles must be rigid: use geoms in its place")
+    if data is not None and data.signature != model.signature:
+        raise InputError("data is of another model; make it anew: mujoco.MjData(model)")
     placed = mujoco.MjData(model) if data is None else copy(data)
     mujoco.mj_kinematics(model, placed)
     bodies = [model.body(k).name for k in range(model.nbody)]

@@ -107,7 +107,7 @@ TIED_CLOTH = CLOTH.format('<edge equality="true"/>')
 """Without constraints, MuJoCo warns."""
 
 
-def test_obstacles_that_are_no_solids_are_refused_and_those_without_names_have_numbers() -> None:
+def test_obstacles_that_are_no_solids_are_refused_and_those_without_names_have_numbers(tmp_path: Path) -> None:
     """Regression: soft bodies were left out without a note."""
     for assets, world, message in (
         (FIELD, '<geom name="hill" type="hfield" hfield="h"/>', "geom hill is of type hfield; obstacles may"),
@@ -115,6 +115,10 @@ def test_obstacles_that_are_no_solids_are_refused_and_those_without_names_have_n
     ):
         model = mujoco.MjModel.from_xml_string(f"<mujoco>{assets}<worldbody>{world}</worldbody></mujoco>")
         refuses(message, rd.Scene.from_mujoco, model)
+    tip = '<body name="left_finger"'
+    with_cloth = ARM.replace(tip, TIED_CLOTH + tip)
+    assert with_cloth != ARM
+    refuses(r".*the robot has a soft part \(flex\)", read, tmp_path, with_cloth)
     # Regression: scenes of Meta-World were refused, since a box has no name.
     assert [shape.name for shape in rd.Scene.from_mujoco(mujoco.MjModel.from_xml_string(BODY.format(""))).shapes] == ["geom0"]
 
@@ -214,6 +218,8 @@ def test_a_scene_around_a_robot_that_has_moved_names_its_base() -> None:
     """Regression: obstacles were where the simulation has them, but the robot where its model places it."""
     box = '<geom name="box" size="0.1 0.1 0.1" type="box" pos="1.1 0 0.2"/>'
     model = mujoco.MjModel.from_xml_string(PLACED.replace("<worldbody>", f"<worldbody>{box}"))
+    other = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))  # Regression: memory was corrupted
+    refuses("data is of another model", rd.Scene.from_mujoco, model, other)
     data = mujoco.MjData(model)
     data.qpos[1] = 0.5  # a joint that is planned
     assert len(rd.Scene.from_mujoco(model, data).shapes) == 1

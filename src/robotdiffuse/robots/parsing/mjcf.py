@@ -78,8 +78,8 @@ def colliding_geoms(model: Any) -> Mask:
 
 def robot_bodies(model: Any) -> list[int]:
     """The bodies of the robot, parents before children: the bodies of all kinematic trees that actuators of
-    joints move. If there is no such tree, the robot is all trees with hinges or slides and without a free
-    joint, or else, as for a humanoid, all trees with hinges or slides."""
+    joints move. If there is no such tree, the robot is all trees with hinges or slides that are no soft body
+    and have no free joint, or else, as for a humanoid, also those with a free joint."""
     roots = model.body_rootid[model.jnt_bodyid]
     kinds = [kind_of("Joint", kind) for kind in model.jnt_type]
     chosen = {
@@ -88,7 +88,7 @@ def robot_bodies(model: Any) -> list[int]:
         if kind_of("Trn", model.actuator_trntype[k]) in ("joint", "jointinparent")
     }
     if not chosen:
-        moving = {*roots[np.isin(kinds, ("hinge", "slide"))]}
+        moving = {*roots[np.isin(kinds, ("hinge", "slide"))]} - {*model.flex_vertbodyid}
         chosen = moving - {*roots[np.isin(kinds, "free")]} or moving
     return np.flatnonzero(np.isin(model.body_rootid, [*chosen])).tolist()
 
@@ -118,8 +118,8 @@ class ConvertedModel:
 
     def __init__(self, path: Path) -> None:
         """Raises InputError as `compiled_model` does, for a model without hinge or slide joints, for ball
-        joints, for colliding geoms of types that are not converted, for keyframes with values that are not
-        finite, and if all joints are slide joints without a range."""
+        joints, for flexes and colliding geoms of types that are not converted, for keyframes with values that
+        are not finite, and if all joints are slide joints without a range."""
         self.path = path
         self.model = model = compiled_model(path)
         self.folder = TemporaryDirectory(prefix="robotdiffuse-mjcf-")
@@ -139,6 +139,8 @@ class ConvertedModel:
                 f"{self.path} has no robot: no body is moved by a hinge or a slide joint; "
                 "rd.Scene.from_mujoco reads obstacles"
             )
+        if np.isin(model.flex_vertbodyid, self.bodies).any():
+            raise InputError(f"{self.path}: the robot has a soft part (flex); use geoms in its place")
         self._link("world")
         self.mimics = self._mimics()
         """The attributes of <mimic>, by index of the joint, for joints that a linear equality constraint ties

@@ -477,7 +477,8 @@ class UrdfTree:
         upper = limits.get("upper", 0.0)
         if lower > upper:
             raise InputError(
-                f"{self.path}: joint {joint.name}: lower limit {lower} is above upper {upper}; exchange them"
+                f"{self.path}: joint {joint.name}: lower limit {lower} is above upper {upper}; exchange them "
+                "(a limit that is not given is 0)"
             )
         for name in RATE_LIMITS:
             if 0 < limits.get(name, 0.0) < MIN_RATE:
