@@ -121,8 +121,9 @@ PLANNING = (
         "explore",
         "explore an unknown scene with a simulated wrist camera",
         "Simulate an arm that goes from a problem's start to its goal and knows of the scene only what depth "
-        "cameras have seen: one at its tip and, for one image, one beside the arm. Shapes named floor are "
-        "known. Each motion is validated in the true scene. Exit status: 0 at the goal, 1 not, 2 bad input.",
+        "cameras have seen. One is at its tip; another, beside the arm, takes a single image. Shapes named "
+        "floor are known. Each motion is validated in the true scene. Exit status: 0 at the goal, 1 not, "
+        "2 bad input.",
         "explore:run_explore",
         (
             PROBLEM,
@@ -374,8 +375,8 @@ ROBOTS = (
                     ("--out FOLDER", "folder to write (default: one in the user's folder of robots)"),
                     (
                         "--group NAME",
-                        "group of the SRDF, or arm, to plan for; the words both and all stand for several "
-                        "arms as one robot (default: the only arm)",
+                        "SRDF group or arm to plan for; 'both' or 'all' takes several arms as one robot "
+                        "(default: the only arm)",
                     ),
                     ("--base LINK", "first link of the arm (default: the root)"),
                     ("--tip LINK", "last link of the arm (default: the link where a gripper begins)"),

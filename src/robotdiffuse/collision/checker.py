@@ -70,8 +70,8 @@ class CollisionChecker:
         )
 
     def pair_clearances(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n pairs"]:
-        """Signed distance between the spheres of each checked pair of links [m], at most 1 m. If the
-        pair's table (`sphere_pair_tables.py`) excludes contact but the spheres touch, the distance is 1 m."""
+        """Signed distance between the spheres of each checked pair of links [m], at most 1 m. It is also 1 m
+        if the spheres touch but the pair's table (`sphere_pair_tables.py`) proves that the links do not."""
         return lane_clearance.pair_clearances(self.robot_arrays, self._rows(q), collision_cost.CLEARANCE_CAP)
 
     def cost_gradients(

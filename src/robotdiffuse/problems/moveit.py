@@ -239,7 +239,8 @@ def moveit_frames(data: object, robot: Robot) -> MoveItFrames:
         child = str(entry.get("child_frame_id", "")).removeprefix("/")
         T = pose_of(f"{location}.transform", entry.get("transform"), "translation", "rotation")
         frame = frame_name(location, entry)
-        # as MoveIt writes them: T is the pose of the header's frame in the child frame, the planning frame
+        # as MoveIt writes them: T is the pose of the header's frame in the child frame, the planning frame;
+        # if the child frame is unknown, T is read as in TF: the pose of the child in the header's frame
         if frame and child in frames:
             frames |= {} if frame in frames.links else {frame: frames[child] @ T}
         elif not frames.unknown_reason and child not in frames.links:
@@ -452,8 +453,8 @@ def scene_state(data: object) -> dict[str, float]:
 
 
 def at_state(robot: Robot, values: Mapping[str, float], stated: Collection[str] = ()) -> Robot:
-    """The robot with the joints that are not planned, and follow no other joint, locked at these values;
-    those in `stated` keep theirs."""
+    """The robot with its joints locked at these values, except planned joints, joints that follow another
+    joint, and joints in `stated`."""
     unplanned = {joint.name for joint in robot.joints if joint.movable and joint.mimic is None}
     unplanned -= {*robot.joint_names, *stated}
     return robot.with_locked({name: value for name, value in values.items() if name in unplanned})
@@ -473,7 +474,7 @@ def scene_robot_notes(data: object, robot: Robot, ignore_joints: bool = False) -
         notes.append(f"the scene's robot_model_name is {shortened(model)}; planned for {robot.name}")
     if mapping_of(SCENE, data).get("is_diff"):
         notes.append(
-            "the scene is a difference (is_diff); obstacles of the scene that it changes are missing"
+            "the scene is a difference (is_diff); all obstacles of the scene that it changes are missing"
         )
     notes += joint_notes("robot_state.joint_state", values, robot, model, ignore_joints)
     for name, neutral in (("padding", 0), ("scale", 1)):
@@ -680,7 +681,7 @@ def _pose_goal(where: str, goal: JsonObject, frames: MoveItFrames, notes: list[s
         raise InputError(f"{where}: {name} has {len(poses)} primitive_poses; it must have one")
     wide = _wide_tolerances(region, orientation)
     if wide:
-        notes.append(f"{where}: its {joined(wide)} are ignored: the goal is the pose itself")
+        notes.append(f"{where}: ignored {joined(wide)}, since the goal is the pose itself")
     T_base_region = frames.of_header("header", position) @ pose_of(*poses[0])
     T_frame_goal = pose_of(where, {"position": [0, 0, 0], "orientation": orientation.get("orientation")})
     T_base_goal = frames.of_header("header", orientation) @ T_frame_goal

@@ -18,10 +18,10 @@ joint-space L2]."""
 MIN_GAIN = np.float32(1e-3)
 """Simplification ends after a round that shortens the path by less than this fraction of its length."""
 REMOVE_SHARE = np.float32(0.1)
-"""Tightening draws a number from 0 to 1 for each attempt. Below this number, it removes a waypoint."""
+"""Fraction of the attempts of tightening that remove a waypoint: those whose random number is below it."""
 PULL_SHARE = np.float32(0.35)
-"""From REMOVE_SHARE on, tightening moves a waypoint towards the chord of its neighbors; from this number on,
-a random move is added."""
+"""The other attempts move a waypoint towards the chord of its neighbors. If their random number is at least
+PULL_SHARE, a random move is added."""
 MAX_RANDOM_MOVE = np.float32(0.3)
 """Largest scale of random moves of a waypoint, in each joint [rad]."""
 RANDOM_MOVE_LOG_RANGE = np.float32(5.0)

@@ -165,7 +165,7 @@ BORDER = np.float32(1.0)
 """In filtered images, pixels up to this far outside a ball's outline must also see past the ball [pixels],
 since the filter moves edges by about one pixel."""
 LITTLE_UNSEEN = 1e-3
-"""If less than this part of the surface was not seen, messages say where it is."""
+"""If the unseen part of the surface is less than this fraction, messages say where this part is."""
 KEY_DECIMALS = 5
 """Configurations that are equal to this number of decimals count as the same."""
 
@@ -430,8 +430,8 @@ def best_viewpoints(
         seen = np.max([seen_share(robot, q, *camera, *space) for camera in each], axis=0)
         if fixed_view is not None:
             poses = np.repeat(T, len(q), axis=0)
-            seen_now = seen_share(robot, q, poses, K, size, reach, *space)
-            seen = seen + np.maximum(seen_now - seen_at_start, 0.0)
+            seen_fixed = seen_share(robot, q, poses, K, size, reach, *space)
+            seen = seen + np.maximum(seen_fixed - seen_at_start, 0.0)
         score = seen / (1 + np.linalg.norm(q - start, axis=1) / HALVING_DISTANCE)
         for earlier in taken:
             score *= np.minimum(np.abs(q - earlier).max(axis=1) / SIMILAR_LOOK, 1.0)

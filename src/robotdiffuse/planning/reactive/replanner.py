@@ -485,7 +485,7 @@ class Replanner:
         # The current motion along the path, before the filter, and the time when it begins [s].
         self._since = -np.inf
         self._motion = AT_REST
-        self._must_leave = self._is_goal(problem.start)
+        self._path_obsolete = self._is_goal(problem.start)
         """Whether the arm must not follow the path beyond the end of its current motion: the goal has
         changed, or the arm was at the goal from the start."""
         self._rehearse()
@@ -520,7 +520,7 @@ class Replanner:
         self.problem = problem
         self._goals = np.array(start_goal.goals)
         self._next = None
-        self._must_leave = True
+        self._path_obsolete = True
 
     @locked
     def step(self, observation: Mapping[str, ArrayLike], now: float) -> Command:
@@ -583,7 +583,7 @@ class Replanner:
     def _at_goal(self) -> bool:
         path = self._path
         s = self._motion.s[0]
-        if self._must_leave:
+        if self._path_obsolete:
             return self._is_goal(path.at(s))
         return bool(path.to_goal and path.then is None and s >= path.end)
 
@@ -668,7 +668,7 @@ class Replanner:
         next_path = self._next or self._path
         clear = self._path_clear(predicted, next_path, self._next is None)
         moving = not self._rests or self._motion.duration > 0
-        leaves = self._must_leave and self._next is None and not self._is_goal(rest)
+        leaves = self._path_obsolete and self._next is None and not self._is_goal(rest)
         if clear and (next_path.to_goal or moving) and not leaves:
             return clear
         candidate = self._search(predicted, rest, rest_time)
@@ -700,7 +700,7 @@ class Replanner:
         # the last part of the current path that is free: the waypoints after its last blocked segment;
         # without one, all but the first, which is `start`
         old = self._goals[:0]
-        if self._path.to_goal and not self._must_leave:
+        if self._path.to_goal and not self._path_obsolete:
             old = self._path.remaining(self._motion.s[-1])
             free = motions_free(search_space(checker, COARSE_RESOLUTION), old.astype(np.float32))
             old = old[1 + np.flatnonzero(~free).max(initial=0) :]
@@ -751,13 +751,13 @@ class Replanner:
         if not self._rests:
             return
         following = self._next
-        if following is None and not self._must_leave and self._motion.s[0] >= self._path.end:
+        if following is None and not self._path_obsolete and self._motion.s[0] >= self._path.end:
             following = self._path.then
         if following is not None:
             self._path = following
             self._next = None
             self._motion = AT_REST
-            self._must_leave = False
+            self._path_obsolete = False
 
     def _extend(self, predicted: PredictedObstacles, grown: PredictedObstacles, clear: bool) -> bool:
         """Extend the motion along the path if the extension is certified. It must also end where no obstacle
@@ -766,7 +766,7 @@ class Replanner:
         path = self._path
         s = self._motion.s[0]
         speed = self._motion.speeds[0]
-        if s >= path.end or self._must_leave:
+        if s >= path.end or self._path_obsolete:
             return False
         for periods in DRIVING_PERIODS:
             extended = path.advance_then_brake(s, speed, periods * settings.period)

@@ -72,10 +72,11 @@ class Bounds(NamedTuple):
     """Tells which points are inside a neighboring link: spheres may contain such points."""
     tight: Spheres = NO_SPHERES
     """Tight places: rows of x, y, z and how far spheres may stick out there [m]. Near these places, `hidden`
-    does not apply."""
+    does not apply to points within 2 `tolerance` of the link."""
     floor: tuple[Vector, float] | None = None
     """Upward normal n and offset [m] of a plane: spheres may not contain points x with n . x below the
-    offset. At points less than `tolerance` above the plane, `hidden` does not apply."""
+    offset. Less than `tolerance` above the plane, `hidden` does not apply to points within 2 `tolerance` of
+    the link."""
 
     @property
     def varies(self) -> bool:
@@ -336,8 +337,8 @@ class Cells(NamedTuple):
     """Indices in `points` of the corners of each cell."""
     sharp: Mask
     """Whether a point is a vertex of a mesh; true for all points if cells were left out or differ in size.
-    Every other point lies on a face or an edge between neighboring points, so a sphere that covers the
-    neighbors covers the point."""
+    A point that is not sharp lies on a face or an edge between neighboring points, so a sphere that covers
+    the neighbors covers the point."""
 
     @staticmethod
     def of(solid: Solid, bounds: Bounds, cut: float, most: int) -> "Cells":

@@ -316,7 +316,7 @@ def test_wide_tolerances_of_a_pose_goal_are_noted() -> None:
     region["primitives"] = [{"type": "sphere", "dimensions": [0.1]}]
     goal["orientation_constraints"][0]["absolute_z_axis_tolerance"] = 3.1
     [note] = moveit.moveit_request(data, moveit.moveit_frames({}, PANDA)).notes
-    assert "region of 0.1 m, tolerance of 3.1 rad are ignored" in note
+    assert "ignored region of 0.1 m, tolerance of 3.1 rad" in note
 
 
 @pytest.mark.parametrize("frame", ["panda_hand", "world"])
