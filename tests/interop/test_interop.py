@@ -304,7 +304,7 @@ def test_bad_csv(tmp_path: Path) -> None:
         ("time,a\n0,x\n", "line 2: a is 'x'; it must be a number"),
         ("\ntime,a\n\n0,1\n\n1,x\n", "line 6: a is 'x'"),
         ("time,a,a_position\n0,1,1\n", "the header has positions of 'a' more than once"),
-        ("time,a,b_velocity\n0,1,1\n", "velocities of other joints"),
+        ("time,a,b_velocity\n0,1,1\n", "both positions and velocities of a, b, or neither"),
         ("time,a\n0,nan\n", "must be finite"),
     ):
         (tmp_path / "m.csv").write_text(text)

@@ -377,8 +377,11 @@ def _table(text: str) -> RecordedMotion:
         columns_of[quantity][joint] = column
     names = list(columns_of["positions"])
     for quantity in RATES:
-        if columns_of[quantity] and sorted(columns_of[quantity]) != sorted(names):
-            raise InputError(f"the header has {quantity} of other joints than positions")
+        incomplete = sorted(columns_of[quantity].keys() ^ {*names})
+        if columns_of[quantity] and incomplete:
+            raise InputError(
+                f"the header must have both positions and {quantity} of {joined(incomplete)}, or neither"
+            )
     table = {
         quantity: np.transpose([of_joint[name] for name in names]) if of_joint else None
         for quantity, of_joint in columns_of.items()
