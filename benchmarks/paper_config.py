@@ -133,6 +133,7 @@ def in_validation(model: MotionNetwork, data: str) -> tuple[float, dict[str, Flo
     _, held_out = loaded.split(MAX_VALIDATION_TRAJECTORIES)
     rng = np.random.default_rng(7)
     trained = planning_success(model, PANDA, held_out, VALIDATION_PROBLEMS, VALIDATION_SAMPLES, rng)
+    assert trained is not None, "all held-out problems are trivial"
     shares: dict[str, list[ndarray]] = {title: [] for title in controls(model)}
     for row in np.flatnonzero(~held_out.trivial)[:VALIDATION_PROBLEMS].tolist():
         start, *_, goal = held_out.q[row].astype(np.float64)

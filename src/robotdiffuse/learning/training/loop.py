@@ -159,8 +159,8 @@ class Validation(NamedTuple):
     loss: float
     """Loss on held-out data."""
     success: float | None = None
-    """Share of collision-free motions among samples for held-out problems; nan without such problems; None:
-    not measured."""
+    """Share of collision-free motions among samples for held-out problems; None: not measured, or there is no
+    such problem."""
 
 
 class TrainingTask(ABC):
@@ -382,9 +382,7 @@ class TrainingRun:
             return
         self._plot()
         success = validation.success
-        free_share = (
-            "" if success is None or math.isnan(success) else f"{success:.1%} of samples collision-free, "
-        )
+        free_share = "" if success is None else f"{success:.1%} of samples collision-free, "
         console.print(
             f"{self.task.title}: {self.fraction:.1%}, {counted(self.at.samples, 'sample')} in "
             f"{self.at.seconds / 60:.1f} min, loss {self.rows[-1]['loss']:.4f}, "

@@ -144,9 +144,9 @@ def planning_success(
     problems: int,
     candidates: int,
     rng: Generator,
-) -> float:
+) -> float | None:
     """Share of collision-free motions among the network's samples: `candidates` samples for each of the first
-    `problems` problems of the data that are not trivial. It is nan if there is no such problem."""
+    `problems` problems of the data that are not trivial. It is None if there is no such problem."""
     settings = SamplingSettings(samples=candidates, sampling_steps=min(SAMPLING_STEPS, model.schedule.steps))
     free = []
     for row in np.flatnonzero(~data.trivial)[:problems].tolist():
@@ -164,7 +164,7 @@ def planning_success(
         q = model.sample(start, goal, embedding.astype(np.float32), clearances, rng, settings, guide)
         space = search_space(checker, CHECK_STEP)
         free.append(np.mean([motions_free(space, motion).all() for motion in q]))
-    return float(np.mean(free)) if free else float("nan")
+    return float(np.mean(free)) if free else None
 
 
 def _guided(guidance: CollisionGuidance, q: ndarray, _level: float) -> ndarray:
@@ -226,7 +226,7 @@ class PlannerTask(MotionTask):
             dropped = torch.from_numpy(rng.random(settings.batch) < settings.condition_drop)
         return self._loss(batch, fraction, rng, dropped)
 
-    def success(self, rng: Generator) -> float:
+    def success(self, rng: Generator) -> float | None:
         if self._on_cpu is not self.model:
             self._on_cpu.load_state_dict(self.model.state_dict())
             self._on_cpu.coarsen(self.model.block)
