@@ -175,6 +175,13 @@ for stream in (1, 2):
 """
 
 
+def test_a_simulation_prints_nothing() -> None:
+    """Regression: each printed `argv[0]=`."""
+    imports = "import robotdiffuse as rd; from robotdiffuse.simulation.world import World"
+    ended = python(imports + "; World(rd.load_robot('so101'), rd.Scene()).close()")
+    assert not ended.stdout + ended.stderr
+
+
 def test_only_the_build_time_is_left_out(tmp_path: FilePath) -> None:
     (tmp_path / "pybullet.py").write_text(PYBULLET)
     ended = python(f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import robotdiffuse.simulation")

@@ -11,6 +11,7 @@ Bullet inflates meshes by 1 mm. A motion with less than 1 mm between a link and 
 between two links, therefore has a contact here.
 """
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -63,6 +64,15 @@ MIN_MASS = 0.01
 W = TypeVar("W", bound="World")
 
 
+class _Bullet(BulletClient):
+    """PyBullet's functions for a simulation of its own. `BulletClient` itself connects with options, which
+    PyBullet prints."""
+
+    def __init__(self) -> None:
+        self._pid = os.getpid()
+        self._client = pybullet.connect(pybullet.DIRECT)
+
+
 class World:
     """A robot on a fixed base, and replaceable obstacles. Call `close`, or use it in a `with` statement.
 
@@ -74,8 +84,7 @@ class World:
     def __init__(self, robot: Robot, scene: Scene, moving: Sequence[MovingObstacle] = ()) -> None:
         """moving: further obstacles, at their poses of time 0 until `move` is called."""
         self.robot = robot
-        self.bullet = BulletClient(pybullet.DIRECT)
-        """PyBullet's functions for this simulation."""
+        self.bullet = _Bullet()
         self._folder = TemporaryDirectory()
         try:
             self._load()
