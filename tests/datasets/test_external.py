@@ -58,6 +58,9 @@ def test_what_cannot_be_exported(tmp_path):
     write_store(store, box_arm(), (3,), 20)
     refuses(r"20 waypoints of 3 joints; robot\.npz holds 254 waypoints of 7", export_npz, store, tmp_path / "robot.npz")
     write_store(tmp_path / "panda", PANDA, ())
+    refuses("holds no shards; make some with", export_npz, tmp_path / "panda", tmp_path / "robot.npz")
+    arrays = random_arrays(PANDA, 3, np.random.default_rng(1)) | {"obstacle_kinds": np.full((3, 4), SPHERE, np.uint8)}
+    write_shard(tmp_path / "panda", 0, arrays, {})
     refuses("no scene of exactly two spheres", export_npz, tmp_path / "panda", tmp_path / "robot.npz")
     assert not (tmp_path / "robot.npz").exists() and len([*tmp_path.iterdir()]) == 2
 
@@ -119,7 +122,11 @@ def test_what_cannot_be_imported(tmp_path, monkeypatch):
         np.savez(file, allow_pickle=False, **arrays)
         refuses(message, import_npz, file, out)
         assert not out.exists()
+    # Regressions: a file in degrees was imported, and an .npy file was called damaged
+    np.savez(file, x_train=50 * x, y_train=y * np.array([50.0] * 14 + [1.0] * 9))
+    refuses(r".*bad.npz: x_train\[0\], row 0: panda_joint", import_npz, file, out)
     np.save(tmp_path / "single.npy", x)
+    refuses("unknown data set format of .*'.npy'; known: .npz", import_npz, tmp_path / "single.npy", out)
     file.write_bytes(b"PK damaged")
     for wrong in (file, tmp_path / "single.npy", tmp_path / "nothing.npz"):
         refuses(f"{wrong.name}", import_npz, wrong, out)

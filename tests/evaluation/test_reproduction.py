@@ -42,6 +42,9 @@ def test_the_papers_method_has_a_row_only_with_weights_that_see_the_code_alone(t
     refuses("whose inputs include clearances", paper.run_table1, with_weights, lambda _: None, lambda *_: None)
     refuses(r"single sample takes about .* denoising steps", paper.run_table1, too_fast, lambda _: None, lambda *_: None)
     assert not list(tmp_path.iterdir())
+    # Regression: the weights of panda_points had two rows, and the error named neither
+    planners = [row.planner for row in too_fast.rows]
+    assert len(planners) == len({*planners}) == len(paper.ROWS) + 1
     assert paper.NO_WEIGHTS in paper.notes(paper.Table1Settings(tmp_path))
     assert not {*"*`"} & {*paper.NO_WEIGHTS}, "notes are plain text"
 

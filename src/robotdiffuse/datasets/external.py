@@ -21,7 +21,14 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError, check_type, counted, joined, numbers, reading, shown
-from robotdiffuse.core.files import check_output, file_name, input_file, lock_folder, write_atomically
+from robotdiffuse.core.files import (
+    check_output,
+    file_name,
+    input_file,
+    known_ending,
+    lock_folder,
+    write_atomically,
+)
 from robotdiffuse.core.settings import AtLeastTwo, converted
 from robotdiffuse.core.types import Done, Path, Trajectory, step_lengths, unreported
 from robotdiffuse.datasets.shards import (
@@ -30,6 +37,7 @@ from robotdiffuse.datasets.shards import (
     Manifest,
     Row,
     check_shapes,
+    existing_shards,
     read_manifest,
     read_shard,
     resample,
@@ -113,7 +121,7 @@ def write_dataset(
         )
     check_type("paths", paths, Iterable, "a list of motions")
     check_type("scenes", scenes, (Scene, list, tuple), "an rd.Scene, or a list of them")
-    motions = [_positions(arm, i, path) for i, path in enumerate(paths)]
+    motions = [_positions(arm, f"paths[{i}]", path) for i, path in enumerate(paths)]
     if not motions:
         raise InputError("paths is empty; a data set has at least one motion")
     per_path = [scenes] * len(motions) if isinstance(scenes, Scene) else list(scenes)
@@ -209,21 +217,21 @@ def measured_row(
     )
 
 
-def _positions(robot: Robot, i: int, path: object) -> ndarray:
+def _positions(robot: Robot, name: str, path: object) -> ndarray:
     positions = path
     if isinstance(path, Path | Trajectory):
         positions = path.positions
-        check_joints(f"paths[{i}]", path.joint_names, robot)
+        check_joints(name, path.joint_names, robot)
     q = numbers(positions)
     if q is None or q.ndim != 2 or q.shape[1] != robot.dof or len(q) < 2:
         names = ", ".join(robot.joint_names)
         raise InputError(
-            f"paths[{i}] is {shown(positions)}; it must be n x {robot.dof} numbers, n at least 2: {names}"
+            f"{name} is {shown(positions)}; it must be n x {robot.dof} numbers, n at least 2: {names}"
         )
     within = np.isfinite(q) & (robot.limit_excess(q) <= LIMIT_SLACK)
     if not within.all():
         row = int(within.min(axis=1).argmin())
-        checked_configuration(robot, f"paths[{i}], row {row}", q[row], [])
+        checked_configuration(robot, f"{name}, row {row}", q[row], [])
     q = np.where(robot.continuous, q, np.clip(q, robot.lower, robot.upper))
     turns = np.concatenate([robot.whole_turns(q[:1]), robot.wraps(q)])
     return q - np.cumsum(turns, axis=0)  # the input may wrap continuous joints
@@ -262,7 +270,7 @@ def export_npz(folder: str | FilePath, file: str | FilePath) -> tuple[int, int]:
     x = []
     y = []
     total = 0
-    for index in shard_indices(folder):
+    for index in existing_shards(folder):
         shard = read_shard(folder, index)
         check_shapes(folder, shard, manifest)
         total += len(shard["trajectories"])
@@ -296,8 +304,8 @@ def import_npz(
     authors' arm has no hand. The safety distance is unknown and set to 0. `progress` is called with the
     number of motions that are done and the number of all.
 
-    Raises InputError if the file is no robot.npz, the robot has other than 7 joints, the radius is not
-    positive, or the folder holds data or cannot be written.
+    Raises InputError if the file is no robot.npz, joint values are out of limits, the robot has other than 7
+    joints, the radius is not positive, or the folder holds data or cannot be written.
     """
     arm = load_robot(robot)
     folder = FilePath(folder)
@@ -305,7 +313,8 @@ def import_npz(
         raise InputError(f"{arm.name} has {arm.dof} joints; robot.npz holds {DOF}")
     if not radius > 0:
         raise InputError(f"radius is {radius}; it must be positive")
-    q, centers = _read(file)
+    stored, centers = _read(file)
+    motions = [_positions(arm, f"{file}: x_train[{i}]", motion) for i, motion in enumerate(stored)]
     floor = load_family("rop").floor
     assert floor is not None
     scenes = [Scene([floor, *(Sphere(center, radius) for center in pair)]) for pair in centers]
@@ -315,12 +324,13 @@ def import_npz(
         "slots": 2,
         "settings": {"imported": FilePath(file).name, "radius": radius},
     }
-    return _write(folder, arm, robot, scenes, q, about, progress)
+    return _write(folder, arm, robot, scenes, np.array(motions, np.float32), about, progress)
 
 
 def _read(file: str | FilePath) -> tuple[Float32[ndarray, "n 254 7"], Float32[ndarray, "n 2 3"]]:
     """The motions, and the centers of the two spheres of each."""
     row_shapes = {"x_train": (WAYPOINTS, DOF), "y_train": (CONDITION_NUMBERS,)}
+    known_ending(file, "data set", (".npz",))
     input_file(file, largest=sys.maxsize)
     with reading(file), np.load(file, allow_pickle=False) as stored:
         x, y = (np.asarray(stored[name], np.float32) for name in row_shapes)

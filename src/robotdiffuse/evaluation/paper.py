@@ -301,7 +301,9 @@ class Table1Settings:
         diffusion = f"diffusion@{self.paper_weights}"
         guided = Row(title, diffusion + GUIDED_SAMPLE)
         unguided = Row(f"{title}, no guidance", diffusion + UNGUIDED_SAMPLE)
-        return (*ROWS[:5], guided, unguided, *ROWS[5:], *controls)
+        # the bundled weights have a row already
+        others = [row for row in ROWS[5:] if row.planner != unguided.planner]
+        return (*ROWS[:5], guided, unguided, *others, *controls)
 
     def command(self, name: str) -> str:
         """The command with these settings: `reproduce` with this name."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from helpers.refusals import refuses
-from robotdiffuse.datasets.shards import shard_path, split_of
+from robotdiffuse.datasets.shards import read_manifest, shard_path, split_of, write_manifest
 from robotdiffuse.learning.checkpoint import load_encoder
 from robotdiffuse.learning.training.batches import load_data
 
@@ -45,8 +45,13 @@ def test_splits_and_waypoints(data, arm):
 
 
 def test_bad_data_give_one_line(data, arm):
-    more = load_encoder(data.parent / "encoder"), WAYPOINTS, print
+    messages = []
+    more = load_encoder(data.parent / "encoder"), WAYPOINTS, messages.append
     refuses("use the robot of the data", load_data, str(data), replace(arm, spheres={}), *more)
+    # Regression: shards that are planned and missing were not counted
+    write_manifest(data, replace(read_manifest(data), trajectories=900, shard=300))
+    load_data(str(data), arm, *more)
+    assert "2 of 3 shards" in messages[-1]
     shutil.rmtree(shard_path(data, 1) / "line_free")
     refuses(r"shard_00001\.zarr", load_data, str(data), arm, *more)
     for i in (0, 1):

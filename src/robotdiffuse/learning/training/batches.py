@@ -2,6 +2,7 @@
 drawn from both."""
 
 import hashlib
+import math
 import timeit
 from collections.abc import Callable
 from contextlib import suppress
@@ -19,7 +20,7 @@ from torch import Tensor
 from robotdiffuse.core.errors import InputError, counted
 from robotdiffuse.core.files import write_atomically
 from robotdiffuse.core.types import Mask, Values, frozen_dataclass
-from robotdiffuse.datasets.shards import SPLITS, read_rows, shard_indices, turns_about_vertical
+from robotdiffuse.datasets.shards import SPLITS, read_manifest, read_rows, turns_about_vertical
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.checkpoint import fingerprint
 from robotdiffuse.learning.encoders.networks import Encoder
@@ -138,7 +139,8 @@ def load_data(
     encoder_fingerprint = "" if encoder is None else fingerprint(encoder)
     fingerprints = list[str]()
     count = 0
-    shards = len(shard_indices(folder))
+    manifest = read_manifest(folder)
+    shards = math.ceil(manifest.trajectories / manifest.shard)
     for rows in read_rows(folder, robot, waypoints, turned_copies):
         fingerprints += [rows.shard.fingerprint] * (rows.turn == 0)
         key = f"{rows.shard.fingerprint}-{encoder_fingerprint}" + (f"-turn{rows.turn}" if rows.turn else "")

@@ -7,6 +7,7 @@ from typing import Annotated, Any, NamedTuple
 
 from robotdiffuse.core.errors import InputError, check_name
 from robotdiffuse.core.settings import (
+    AtLeastTwo,
     Bound,
     Count,
     Natural,
@@ -58,7 +59,7 @@ class TrainingSettings(Settings):
     length."""
     samples: Count | None = None
     """Length of the run in training samples. Such runs are reproducible; runs by `minutes` are not."""
-    seed: Natural = 0
+    seed: Annotated[int, Bound(least=0.0, below=2.0**63)] = 0
     batch: Count = 128
     """Number of samples in a training step."""
     learning_rate: Positive = 1e-3
@@ -106,7 +107,7 @@ class EncoderTraining(TrainingSettings):
     checkpoint_seconds: NotNegative = 60.0
     scenes: Annotated[str, OneOf(("mixed", "rop"))] = "mixed"
     """Training scenes. mixed: of every kind; rop: with two large obstacles each, as in the paper's data."""
-    max_obstacles: Natural = 12
+    max_obstacles: AtLeastTwo = 12
     """Largest number of obstacles in a mixed training scene."""
     points: Count = 256
     """Largest number of points of a training cloud; the clouds of a step have between an eighth of this
