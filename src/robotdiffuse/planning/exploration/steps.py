@@ -76,7 +76,7 @@ class ExplorerSettings(Settings, name="explorer"):
     """Minimum stated confidence of motions under the probabilistic policy."""
     time_limit: Positive = 1.0
     """Time limit of each search [s]."""
-    max_views: Natural = 8
+    max_views: Natural = 16
     """Maximum number of steps of the kind look on the way to a goal."""
     look_attempts: Count = 4
     """A step tries to plan motions to the best viewpoints: to at most this number times the number of
