@@ -52,6 +52,9 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
     assert bench.run_bench(asked, quiet, quiet) == 0
     rows = read_records(tmp_path)
     assert list(rows) == [plain, with_settings], "a planner with settings is a row of its own"
+    # Regression: other commands did not read the problems of a bench
+    again = rd.load_problem(tmp_path / "problems" / "rop.jsonl", 1)
+    assert np.array_equal(again.start, held_out_problem("rop", 1).start)
     for records in rows.values():
         assert keys(records) == {("rop", f"rop/{i}", seed, 20.0): 1 for i in range(2) for seed in range(2)}
     records = rows[plain]

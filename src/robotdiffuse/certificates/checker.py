@@ -71,8 +71,8 @@ def check(
     Robot, scene and motion must have the content that was certified. The motion must keep the limits along
     the cubics that join its rows, begin at the start, stop at each waypoint or pass it within its blend, and
     end at the goal. Every stretch must be proved free. `requirements.not_checked` lists what is not checked.
-    Raises InputError if there is no problem, or a damaged one in the certificate, and for shapes, names of
-    links and goals of Cartesian lines that certificates do not support.
+    Raises InputError if there is no problem, or a damaged one in the certificate; and for what certificates
+    do not support: some shapes, some names of links, and Cartesian lines whose goal is not a single pose.
     """
     if problem is None:
         if certificate.problem is None:

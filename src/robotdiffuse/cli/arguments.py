@@ -48,8 +48,8 @@ def option(parser: ActionsContainer, spec: str, help: str, *more: Any) -> None:
 
 
 def chosen(arguments: Namespace, names: Iterable[str]) -> dict[str, Any]:
-    """The options of these names that the user gave or that have a default, flags included; for all others,
-    the settings keep their defaults."""
+    """The values of the options with these names, except those that are None: they were not given, so the
+    settings keep their own defaults. Flags are always included."""
     return {name: value for name, value in vars(arguments).items() if name in names and value is not None}
 
 

@@ -437,8 +437,8 @@ COMMANDS = {
         Command(
             "completion",
             "print a script that completes commands and options in bash or zsh",
-            "Print a script that completes commands and options: "
-            'eval "$(robotdiffuse completion bash)" in ~/.bashrc, or with zsh in ~/.zshrc.',
+            "Print a script that completes commands and options. To use it, add this line to ~/.bashrc: "
+            'eval "$(robotdiffuse completion bash)" (for zsh: to ~/.zshrc, with zsh in place of bash).',
             "completion:run_completion",
             (("shell", "the shell", {"choices": SHELLS}),),
         ),

@@ -133,9 +133,9 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
 def load_problems(file: str | Path, ignore_joints: bool = False) -> list[ProblemEntry]:
     """All problems of a .jsonl file or a MotionBenchMaker folder, or the one problem of another file.
 
-    In a .jsonl file, each line is a problem as in `load_problem`, named after the file and its line number;
-    the first wrong line raises InputError with its number. For folders see `load_motion_bench_maker`;
-    `ignore_joints` as in `load_problem`.
+    In a .jsonl file, each line is a problem as in `load_problem`, or one that `robotdiffuse bench` wrote. It
+    is named after the file and its line number; the first wrong line raises InputError with its number. For
+    folders see `load_motion_bench_maker`; `ignore_joints` as in `load_problem`.
     """
     file = file_name(file, "problem file")
     if file.is_dir():
@@ -150,7 +150,10 @@ def load_problems(file: str | Path, ignore_joints: bool = False) -> list[Problem
 
 def _problem_of_line(file: Path, number: int, line: str, ignore_joints: bool) -> Problem:
     location = f"{file}, line {number}"
-    return _problem(location, parse_json(line, location), file.parent, ignore_joints=ignore_joints)
+    value = parse_json(line, location)
+    if isinstance(value, dict) and {"name", "family", "problem"} <= value.keys():  # as a bench writes it
+        value = value["problem"]
+    return _problem(location, value, file.parent, ignore_joints=ignore_joints)
 
 
 def _lines(text: str) -> list[tuple[int, str]]:

@@ -154,8 +154,8 @@ def frame_name(where: str, entry: JsonObject) -> str:
 def read_moveit_scene(
     file: str | Path, robot: Robot, ignore_joints: bool = False
 ) -> tuple[Scene, Robot, tuple[str, ...]]:
-    """The collision objects of a planning scene, in the frame of the robot's base; the robot with the joints
-    that are not planned at their values in robot_state; and notes on differences between the scene's robot
+    """The collision objects of a planning scene, in the frame of the robot's base; the robot, with its
+    unplanned joints locked at their values in robot_state; and notes on differences between the scene's robot
     and `robot`.
 
     The pose of the root of the robot's URDF comes from robot_state.multi_dof_joint_state, and the pose of the
@@ -543,7 +543,8 @@ class MoveItRequest:
     start: dict[str, float]
     """Joint values by name [rad] or [m], including fingers."""
     joint_goals: dict[str, dict[str, float]]
-    """Alternative goals, each with joint values by name, by their places in the request, for messages."""
+    """Joint values by name of each alternative goal. The keys are the goals' places in the request, for
+    messages."""
     pose_goal: tuple[str, Pose] | None
     """A link and its goal pose T_base_link."""
     attached: tuple[MoveItAttached, ...]
@@ -668,7 +669,8 @@ def _pose_goal(where: str, goal: JsonObject, frames: MoveItFrames, notes: list[s
     link = position.get("link_name")
     if link != orientation.get("link_name"):
         raise InputError(
-            f"{where} constrains {link} and {orientation.get('link_name')}; both must constrain one link"
+            f"{where} constrains the position of {link} and the orientation of "
+            f"{orientation.get('link_name')}; both must be of one link"
         )
     check_type(f"{at}.link_name", link, str, "the name of a link")
     offset = xyz_of("target_point_offset", position.get("target_point_offset") or [0, 0, 0])

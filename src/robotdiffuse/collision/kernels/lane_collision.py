@@ -137,8 +137,8 @@ def make_workspace(robot):
 @allocation_free(forceinline=True)
 def _touching(centers, radius, solid):
     """Mask of the lanes with a sphere that touches an obstacle, a row of `SceneArrays.solids`. Entries 12 to
-    14 of the row are the half edges (of a cylinder: the radius twice, and the half height), entry 15 is the
-    radius that is added, and entry 16 is 1 for a cylinder."""
+    14 of the row are the half edges (of a cylinder: radius, radius, half height), entry 15 is the radius that
+    is added, and entry 16 is 1 for a cylinder."""
     u, v, w = in_axes(solid, minus(centers, solid))
     w = maximum(absolute(w) - solid[14], ZERO)
     reach = radius + solid[15]

@@ -78,7 +78,7 @@ class SampledProblem:
     """Target pose of the tip. If the target is only a position, the first goal gives the orientation."""
 
     def problem(self, robot: Robot) -> Problem:
-        """Make the problem of reaching any of the goals; joints may end whole turns away from it.
+        """Make the problem of reaching any of the goals; joints may end whole turns away from a goal.
 
         Args:
             robot: The robot for which the problem was drawn.
@@ -208,7 +208,7 @@ def between_targets(
 ) -> SampledProblem | None:
     """A problem whose start reaches the first of two targets, and whose goals, up to `goals` configurations,
     reach the second; None if no free configuration reaches one of the targets. The second target is drawn
-    only once the first is reached."""
+    after the first is reached, and not otherwise."""
     reached = []
     T_base_tip = np.eye(4)
     for T_base_tip, count in zip(targets, (1, goals), strict=True):

@@ -23,7 +23,7 @@ def split(triangles: Triangles, size: "float | Float[ndarray, 'n']", reach: floa
 def _split(triangles, squares, reach):
     count = len(triangles)
     out = np.concatenate((triangles, np.empty_like(triangles)))
-    limits = np.concatenate((squares, squares))
+    limits = np.concatenate((squares, squares))  # squared greatest edge lengths, one for each triangle
     edges = np.empty(3)  # squared lengths of the edges from each corner to the next
     t = 0
     while t < count:
@@ -58,6 +58,8 @@ def _split(triangles, squares, reach):
         # inequality).
         projection = (shortest_square + longest_square - max(after, before)) / (2 * longest)
         at = max(projection, np.sqrt(limits[t]) - np.sqrt(shortest_square)) / longest
+        # in the middle instead if the shortest edge needs cuts too, or if the cut would be nearer to that end
+        # than half the limit
         if shortest_square > limits[t] or 4 * at * at * longest_square < limits[t]:
             at = 0.5
         at = min(at, 0.5) if before < after else 1 - min(at, 0.5)
