@@ -14,8 +14,10 @@ from helpers.box_arm import box_arm
 from helpers.heavy_arms import ROBOTS, TURNED, pendulum, wild
 from helpers.panda import PANDA
 from robotdiffuse.certificates.bounds import MovingProver, Stretches
+from robotdiffuse.certificates.checker import check
 from robotdiffuse.certificates.proof import hash_of, request_parts, scene_parts
 from robotdiffuse.certificates.requirements import constraint_bounds, inverse_dynamics, torque_bounds
+from robotdiffuse.interop.recorded_motion import checked_motion, motion_of_robot
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.robots.dynamics import Dynamics
@@ -219,3 +221,20 @@ def test_another_payload_needs_another_proof() -> None:
     heavier = replace(problem, payload=rd.Payload(3.5, [0.0, 0.0, 0.1]))
     refused(certificate, heavier, "panda_joint2 is not shown to keep its limit")
     refused(certificate, replace(problem, payload=None), "torques: the problem has no payload")
+
+
+def test_blends_are_judged_on_the_cubics_as_by_the_validator() -> None:
+    """Regression: on straight lines between rows, so a proof held for a motion that missed its waypoint."""
+    x, y = np.eye(7)[:2]
+    t = np.array([0.0, 1.0, 2.0])
+    q = np.array(START) + np.outer(0.4 * t, x)
+    v = np.outer([0, 1, 0], 0.4 * x + 0.3 * y)
+    motion = motion_of_robot(checked_motion(PANDA.joint_names, q, t, v), PANDA).motion
+    assert isinstance(motion, rd.Trajectory)
+    on_cubic = motion.at(np.array([2 / 3])).positions[0]
+    for waypoint, reached in ((on_cubic, True), ((q[0] + q[1]) / 2, False)):
+        problem = rd.Problem(PANDA, rd.Scene(), q[0], q[-1], waypoints=[rd.JointGoal(waypoint)], blend=0.01)
+        assert rd.verify(problem, motion).valid == reached
+        proof = rd.certify(replace(problem, waypoints=(), blend=()), motion)
+        errors = [line for line in check(proof, problem).differences if line.startswith("motion:")]
+        assert errors == ([] if reached else ["motion: it does not pass within 0.01 of waypoints[0] after those before it"])

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+import robotdiffuse as rd
 from helpers.commands import BALL, PROBLEM, Said, run
 from helpers.full_disk import full_disk
 
@@ -56,6 +57,21 @@ def test_motions_from_other_programs(planned: Path, said: Said) -> None:
     assert run("verify", "m.mcap") == 0  # the problem is in it
     assert "holds no problem; give --problem FILE, or --scene FILE" in said(2, "verify", planned / "m.yaml")
     assert "--scene and --robot belong together" in said(2, "verify", planned / "m.yaml", "--scene", planned / "scene.yaml")
+    # Regression: the certificate replaced the scene
+    Path("scene.json").write_text("{}")
+    asked = ("verify", planned / "m.yaml", "--scene", "scene.json", "--robot", "panda", "--certificate", "scene.json")
+    assert "scene.json is an input of this command" in said(2, *asked)
+
+
+def test_waypoints_among_moving_obstacles_have_a_note(tmp_path: Path, said: Said) -> None:
+    """Regression: waypoints through a moving obstacle were valid, without a word."""
+    problem = tmp_path / "p.yaml"
+    ball = "moving: [{sphere: {center: [0.5, 0, 0.5], radius: 0.25}, velocity: [0, 0, 0]}]"
+    problem.write_text(f"robot: panda\nscene: []\nstart: ready\ngoal: {{joints: ready}}\n{ball}\n")
+    start = rd.load_problem(problem).start
+    names = [f"panda_joint{i}" for i in range(1, 8)]
+    (tmp_path / "m.csv").write_text(f"{','.join(names)}\n{','.join(map(str, start))}\n")
+    assert "contacts with moving obstacles are not checked" in said(0, "verify", tmp_path / "m.csv", "--problem", problem)
 
 
 def test_all_violations_are_listed(planned: Path, said: Said) -> None:
@@ -85,6 +101,7 @@ def test_only_valid_motions_are_exported(planned: Path, said: Said) -> None:
 
 
 def test_options_that_would_be_ignored_are_refused(planned: Path, said: Said) -> None:
+    assert "--ignore-joints is for MoveIt files" in said(2, "verify", planned / "r.json", "--ignore-joints")
     assert "--index says which" in said(2, "verify", planned / "r.json", "--index", 3)
     assert "--topic is for bags" in said(2, "verify", planned / "r.json", "--topic", "/x")
     assert "--shell is for pictures" in said(2, "view", planned / "r.json", "--shell", 0.05, "--out", "a.png")

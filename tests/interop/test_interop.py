@@ -234,6 +234,21 @@ def test_positions_and_times_alone_are_validated_on_the_smoothest_curve() -> Non
     assert refused is not None and refused.kind in ("velocity", "acceleration", "jump")
 
 
+def test_what_a_recording_lacks_is_noted_and_taken_from_the_problem() -> None:
+    """Regressions: splines began at rest whatever the `start_velocity`, a first row was not unwrapped; rates without times."""
+    robot = rd.load_robot("gen3")
+    t = np.linspace(0, 1, 11)
+    q = np.array([3.4, 0.3, 0, 1.5, 0, 1, 0]) + np.outer(t - t**2 / 2, np.eye(7)[0])
+    problem = Problem(robot, Scene(), q[0], q[-1], start_velocity=np.eye(7)[0])
+    recorded = recorded_motion.checked_motion(robot.joint_names, q - [2 * np.pi, 0, 0, 0, 0, 0, 0], t)
+    motion, notes = vars(recorded_motion.motion_of_robot(recorded, robot, problem)).values()
+    np.testing.assert_allclose(motion.positions, q, atol=1e-12)
+    np.testing.assert_allclose(motion.velocities, np.outer(1 - t, np.eye(7)[0]), atol=1e-9)
+    assert "jump by whole turns" in notes[0] and "from start_velocity to rest" in notes[1]
+    [note] = recorded_motion.checked_motion(robot.joint_names, q, velocities=q).notes
+    assert "velocities are ignored" in note
+
+
 def of_panda(names: list[str], rows: list[list[float]]) -> None:
     recorded_motion.motion_of_robot(recorded_motion.checked_motion(names, rows), PANDA)
 
@@ -306,6 +321,7 @@ def test_bad_csv(tmp_path: Path) -> None:
         ("time,a,a_position\n0,1,1\n", "the header has positions of 'a' more than once"),
         ("time,a,b_velocity\n0,1,1\n", "both positions and velocities of a, b, or neither"),
         ("time,a\n0,nan\n", "must be finite"),
+        (",time,a\n0,0,1\n", "column 1 of the header has no name"),  # the index that pandas writes
     ):
         (tmp_path / "m.csv").write_text(text)
         refuse(tmp_path / "m.csv", rf"^{tmp_path}/m\.csv.*{wanted}")

@@ -528,7 +528,7 @@ def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
         yield f"motion: it begins {off:.3g} off the start"
     if not at_goal(robot, problem.goal, motion.positions[-1:], tolerances).all():
         yield "motion: it does not end at the goal"
-    yield from _waypoint_errors(problem, motion, tolerances)
+    yield from _waypoint_errors(problem, certificate)
     if isinstance(motion, Trajectory):
         start_velocity = np.zeros(robot.dof) if problem.start_velocity is None else problem.start_velocity
         yield from _rate_errors(robot, motion, certificate, start_velocity)
@@ -592,23 +592,28 @@ def _jerk_errors(robot: Robot, motion: Path | Trajectory, certificate: MotionPro
             yield f"jerks: that of {name} is {jerk:.6g}, not {stated[name]:.6g}"
 
 
-def _waypoint_errors(problem: Problem, motion: Path | Trajectory, tolerances: Tolerances) -> Iterator[str]:
+def _waypoint_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     """The first waypoint that the motion misses. It must reach the waypoints in order, and either stop at
     each or pass within its blend."""
     robot = problem.robot
+    motion = certificate.motion
+    tolerances = certificate.tolerances
+    line = configurations(motion, certificate.between)
+    numbers = np.arange(len(line), dtype=float)
+    stops = numbers[np.isin(places_of(motion, certificate.between), clock(motion))]  # the rows
+    if isinstance(motion, Trajectory):
+        stops = stops[(np.abs(motion.velocities) <= tolerances.rest).all(axis=1)]
     after = 0.0
     for k, (goal, blend) in enumerate(zip(problem.waypoints, problem.blend, strict=True)):
-        places = rows = np.arange(len(motion.positions), dtype=float)
-        if isinstance(motion, Trajectory):
-            places = rows[(np.abs(motion.velocities) <= tolerances.rest).all(axis=1)]
+        places = stops
         if blend:
-            # samples on the straight lines between rows, closer together than the blend is wide
-            lengths = step_lengths(motion.positions)
+            # samples on the straight lines that were certified, closer together than the blend is wide
+            lengths = step_lengths(line)
             counts = np.clip(np.ceil(lengths / (BLEND_SHARE * blend)), 1, MAX_BLEND_SAMPLES).astype(int)
             within = [i + np.arange(count) / count for i, count in enumerate(counts)]
-            places = np.concatenate([*within, rows[-1:]])
+            places = np.concatenate([*within, numbers[-1:]])
         places = places[places >= after]
-        q = interpolated(places, rows, motion.positions)
+        q = interpolated(places, numbers, line)
         reached = np.flatnonzero(at_goal(robot, goal, q, tolerances, blend))
         if not len(reached):
             requirement = f"pass within {blend:g} of" if blend else "stop at"

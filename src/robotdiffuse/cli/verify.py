@@ -23,10 +23,12 @@ from robotdiffuse.validation.validator import verify, violations
 def run_verify(arguments: Namespace) -> int:
     out = arguments.certificate
     if out:
-        out = check_output(out, (".json",), arguments.motion, arguments.problem)
+        out = check_output(out, (".json",), arguments.motion, arguments.problem, arguments.scene)
     problem, motions, notes = _read(arguments)
     for note in (*problem.notes, *notes, *contact_notes(problem.scene)):
         print(f"note: {note}")
+    if problem.moving and "trajectory" not in motions:
+        print("note: the motion has no times: contacts with moving obstacles are not checked")
     valid = all([_validated(problem, label, motion, arguments.all) for label, motion in motions.items()])
     if out and valid:
         from robotdiffuse.certificates.search import certify
@@ -116,6 +118,10 @@ def _read(
     if arguments.index and arguments.problem is None:
         raise InputError("--index says which problem of --problem FILE; give --problem too, or no --index")
     only_motion = arguments.problem is None and arguments.scene is None
+    if only_motion and arguments.ignore_joints:
+        raise InputError(
+            "--ignore-joints is for MoveIt files; give --problem or --scene too, or leave it out"
+        )
     if only_motion and ending == ".json":
         result, problem = read_solved(arguments.motion)
         motions = {"path": result.path, "trajectory": result.trajectory}
@@ -131,7 +137,7 @@ def _read(
         scene, robot, scene_notes = read_moveit_scene(str(arguments.scene), robot, arguments.ignore_joints)
         problem = problem_of_motion(recorded, robot, scene)
     with located(arguments.motion):
-        converted = motion_of_robot(recorded, problem.robot)
+        converted = motion_of_robot(recorded, problem.robot, problem)
     label = "trajectory" if isinstance(converted.motion, Trajectory) else "path"
     return problem, {label: converted.motion}, (*scene_notes, *converted.notes)
 

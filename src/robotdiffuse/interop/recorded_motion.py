@@ -22,6 +22,7 @@ from robotdiffuse.core.types import (
     ROWS,
     Configurations,
     JointRows,
+    JointValues,
     Path,
     Trajectory,
     Values,
@@ -68,14 +69,16 @@ def checked_motion(
 
     Empty times, velocities and accelerations count as absent. If there are several rows and all their times
     are 0, the times count as absent too. If there are no times, the velocities and accelerations are left
-    out. Times are shifted to begin at 0. Raises InputError as `check_motion_arrays` does, and for times that
-    do not increase.
+    out, with a note. Times are shifted to begin at 0. Raises InputError as `check_motion_arrays` does, and
+    for times that do not increase.
     """
     optional_fields = {"times": times, "velocities": velocities, "accelerations": accelerations}
     arrays = {name: value for name, value in optional_fields.items() if not _empty(value)}
     joints, checked = check_motion_arrays(names, {"positions": positions, **arrays})
     if "times" not in checked:
-        return RecordedMotion(joints, checked["positions"])
+        rates = joined(checked.keys() - {"positions"})
+        notes = (f"there are no times: {rates} are ignored, and the motion is validated as a path",)
+        return RecordedMotion(joints, checked["positions"], notes=notes if rates else ())
     t = checked["times"]
     if len(t) > 1 and not t.any():
         note = "all times are 0: the motion is validated as a path"
@@ -104,12 +107,13 @@ class RobotMotion:
     notes: tuple[str, ...]
 
 
-def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
+def motion_of_robot(motion: RecordedMotion, robot: Robot, problem: Problem | None = None) -> RobotMotion:
     """The motion of a robot's planned joints, matched by name.
 
-    Jumps of continuous joints by whole turns are removed. The recording may contain other joints of the
-    robot, if these stay at their locked values. Missing velocities are those of the cubic spline through the
-    rows that starts and ends at rest. A missing acceleration is the mean of the accelerations of the two
+    Jumps of continuous joints by whole turns are removed, also from the start of a problem to the first row.
+    The recording may contain other joints of the robot, if these stay at their locked values. Missing
+    velocities are those of the cubic spline through the rows that ends at rest and starts at the problem's
+    `start_velocity`, without it at rest. A missing acceleration is the mean of the accelerations of the two
     cubics that meet at its row.
 
     Raises InputError for missing or unknown joints, and for other joints that leave their locked values.
@@ -133,9 +137,10 @@ def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
     if order != sorted(order):
         notes.append("joints were reordered by name")
     q = motion.positions[:, order]
-    turns = robot.wraps(q)
+    start = q[0] if problem is None else problem.start
+    turns = robot.wraps(np.vstack([start, q]))
     if turns.any():
-        q = q - np.concatenate([turns[:1] * 0, np.cumsum(turns, axis=0)])
+        q = q - np.cumsum(turns, axis=0)
         wrapped = [robot.joint_names[j] for j in np.flatnonzero(turns.any(axis=0))]
         notes.append(f"values of {joined(wrapped, MAX_NAMES)} jump by whole turns; they were unwrapped")
     if motion.times is None:
@@ -143,8 +148,12 @@ def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
     v = None if motion.velocities is None else motion.velocities[:, order]
     a = None if motion.accelerations is None else motion.accelerations[:, order]
     if v is None:
-        v = _spline_velocities(motion.times, q)
-        notes.append("no velocities are given: those of a cubic spline from rest to rest are validated")
+        start_velocity = None if problem is None else problem.start_velocity
+        v = _spline_velocities(
+            motion.times, q, np.zeros(robot.dof) if start_velocity is None else start_velocity
+        )
+        begin = "rest" if start_velocity is None else "start_velocity"
+        notes.append(f"no velocities are given: those of a cubic spline from {begin} to rest are validated")
     if a is None:
         a = _mean_accelerations(Trajectory(robot.joint_names, motion.times, q, v, np.zeros_like(v)))
         notes.append("no accelerations are given: those of the cubics through the rows are validated")
@@ -167,13 +176,14 @@ def _check_locked(values: Values, name: str, robot: Robot) -> None:
         )
 
 
-def _spline_velocities(times: Values, q: Configurations) -> JointRows:
-    """Velocities of the cubic spline through the rows that starts and ends at rest."""
+def _spline_velocities(times: Values, q: Configurations, start: JointValues) -> JointRows:
+    """Velocities of the cubic spline through the rows that begins at velocities `start` and ends at rest."""
     if len(times) < 2:
-        return np.zeros_like(q)
+        return np.tile(start, (len(q), 1))
     from scipy.interpolate import CubicSpline
 
-    return CubicSpline(times, q, bc_type="clamped")(times, 1)
+    ends: Any = ((1, start), (1, np.zeros_like(start)))
+    return CubicSpline(times, q, bc_type=ends)(times, 1)
 
 
 def _mean_accelerations(motion: Trajectory) -> JointRows:
@@ -352,6 +362,8 @@ def _table(text: str) -> RecordedMotion:
     header = [cell.strip() for cell in rows[0][1]]
     # `Trajectory.save` puts a quote before names that a spreadsheet would take for formulas
     header = [cell[1:] if cell[:1] == "'" and cell[1:2] in "=+-@" else cell for cell in header]
+    if "" in header:  # such as the index that pandas writes
+        raise InputError(f"column {header.index('') + 1} of the header has no name; leave it out, or name it")
     if len(rows) == 1:
         raise InputError("it has a header and no rows")
     columns: list[list[float]] = [[] for _ in header]
