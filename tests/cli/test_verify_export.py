@@ -100,6 +100,12 @@ def test_only_valid_motions_are_exported(planned: Path, said: Said) -> None:
     assert "known: .json, .csv, .mcap, .rosbag2, .rrd, .yaml" in said(2, "export", planned / "r.json", "--out", "a.foo")
 
 
+def test_a_problem_without_scene_is_no_result(tmp_path: Path, said: Said) -> None:
+    """Regression: the message listed the fields that a result would have."""
+    (tmp_path / "p.json").write_text('{"robot": "panda", "start": "ready", "goal": "extended"}')
+    assert "has no scene" in said(2, "view", tmp_path / "p.json", "--out", "x.html")
+
+
 def test_options_that_would_be_ignored_are_refused(planned: Path, said: Said) -> None:
     assert "--ignore-joints is for MoveIt files" in said(2, "verify", planned / "r.json", "--ignore-joints")
     assert "--index says which" in said(2, "verify", planned / "r.json", "--index", 3)

@@ -267,4 +267,5 @@ def test_links_are_written_through_and_impossible_names_refused(tmp_path: Path) 
     write_atomically(tmp_path / "latest.json", "new")
     assert (tmp_path / "latest.json").is_symlink() and (tmp_path / "run.json").read_text() == "new"
     for name in ("a\0.json", "\ud800.json"):
+        refuses("not a valid file name", write_atomically, tmp_path / name, "")
         refuses("not a valid file name", rd.Trajectory(("joint",), np.zeros(1), *[np.zeros((1, 1))] * 3).save, name)

@@ -289,8 +289,8 @@ def test_other_problems_of_the_same_name_are_refused(tmp_path: Path) -> None:
     refuses("have the name of the family rop", gather_cases, [str(tmp_path / "rop.jsonl")], None, tmp_path / "out", quiet)
 
 
-def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Regression: calls with other weights of the same name were not made, or were put into the same row."""
+def test_other_weights_of_the_same_name_and_another_clock_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: calls with other weights of the same name were not made, or put into the same row; so with --cpu-time."""
     monkeypatch.setattr(bench, "keep_records", lambda *_: 0)
     for parent, digest in (("a", "1"), ("b", "2")):
         (tmp_path / parent / "best").mkdir(parents=True)
@@ -299,6 +299,8 @@ def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch:
     for _ in range(2):
         bench.run_bench(first, quiet, quiet)
     refuses("has records of mpnet@best with other weights than those in", bench.run_bench, other, quiet, quiet)
+    timed = replace(first, cpu_time=True)
+    refuses("has records of calls without --cpu-time, this run is with it", bench.run_bench, timed, quiet, quiet)
 
 
 def test_bad_settings_are_told_before_anything_is_made(tmp_path: Path) -> None:

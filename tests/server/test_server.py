@@ -99,6 +99,9 @@ def test_a_plan_is_that_of_the_bare_planner_and_the_validator_agrees(server: htt
     straight = {"problem": problem(), "path": {"joint_names": JOINTS, "positions": [LEFT, RIGHT]}}
     verdict = server.post("/verify", json=straight | {"trajectory": None}).json()
     assert not verdict["valid"] and verdict["path"]["violation"]["other"] == "wall"
+    cut = json.dumps(straight).replace('"wall"', '"\\ud800"')  # Regression: code 500
+    verdict = server.post("/verify", content=cut, headers={"Content-Type": "application/json"}).json()
+    assert verdict["path"]["violation"]["other"] == "\ud800"
 
 
 def test_a_batch_is_answered_line_by_line_in_order(server: httpx.Client) -> None:

@@ -75,7 +75,7 @@ def _read(file: str) -> tuple[PlanResult | None, Problem]:
     """The result in a file, and its problem; for a problem file, None and the problem."""
     ending = Path(file).suffix.lower()
     record = read_json(file) if ending == ".json" else {}
-    is_problem = isinstance(record, dict) and "scene" in record and "status" not in record
+    is_problem = isinstance(record, dict) and {"scene", "start"} & record.keys() and "status" not in record
     if ending in PROBLEM_ENDINGS or is_problem:
         return None, load_problem(file)
     return read_result(file)

@@ -409,7 +409,9 @@ def write_atomically(
     cannot be written, and its subclass OutputError for an error of the disk, such as a full one.
     """
     with writing(file):
-        target = Path(os.path.realpath(file))  # a link stays, and the file that it names is replaced
+        target = Path(
+            os.path.realpath(file_name(file))
+        )  # a link stays, and the file that it names is replaced
         temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
         if make_folder:
             target.parent.mkdir(parents=True, exist_ok=True)

@@ -395,15 +395,15 @@ def run_bench(settings: BenchSettings, report: Progress, done: Done) -> int:
     A call is not repeated if a record with a shorter time limit shows that it ended before that limit, since
     more time would not change its result. With `equal_time`, such a call is repeated if another seed could
     change its result. Raises InputError, before any call, for a folder that another process uses, a planner
-    that cannot be loaded, weights other than those of the folder's records, and problems that `gather_cases`
-    refuses; KeyboardInterrupt on Ctrl-C. Running again with the same settings then continues.
+    that cannot be loaded, weights or a clock other than those of the folder's records, and problems that
+    `gather_cases` refuses; KeyboardInterrupt on Ctrl-C. Running again with the same settings then continues.
     """
     with lock_folder(settings.out):
         specs = settings.specs
         for spec in specs.values():
             spec.load()
         sessions = JsonLines(settings.out / "runs.jsonl")
-        _check_weights(settings, sessions.rows)
+        _check_sessions(settings, sessions.rows)
         cases = gather_cases(list(settings.problems), settings.count, settings.out, report)
         session = _note_session(settings, sessions)
         suffixes = ("", RESTARTED) if settings.equal_time else ("",)
@@ -435,9 +435,15 @@ def open_runs(
     return [run for run in runs if (run.method, *run.case.key, run.seed) not in answered]
 
 
-def _check_weights(settings: BenchSettings, sessions: Sequence[Mapping[str, Any]]) -> None:
-    """Raise InputError if a planner of the same name was run in this folder with other weights: records of
-    different weights would be mixed."""
+def _check_sessions(settings: BenchSettings, sessions: Sequence[Mapping[str, Any]]) -> None:
+    """Raise InputError if calls in this folder were timed by another clock, or a planner of the same name was
+    run with other weights: different records would be mixed."""
+    if any(session.get("cpu_time", False) != settings.cpu_time for session in sessions):
+        ours, theirs = ("with", "without") if settings.cpu_time else ("without", "with")
+        raise InputError(
+            f"{settings.out} has records of calls {theirs} --cpu-time, this run is {ours} it; use the same "
+            "clock, or another folder"
+        )
     for label, spec in settings.specs.items():
         now = spec.weights_hashes
         if any(session.get("weights", {}).get(label, now) != now for session in sessions):

@@ -324,8 +324,9 @@ def about(bench: Bench) -> list[str]:
     for run in bench.sessions:
         versions = ", ".join(f"{name} {version}" for name, version in run["versions"].items())
         machine = f"{run.get('processor', '?')}, {counted(run.get('cores', '?'), 'core')}"
+        clock = ", CPU time" if run.get("cpu_time") else ""
         text = (
-            f"{machine}, {counted(run.get('workers', '?'), 'worker')}; Python "
+            f"{machine}, {counted(run.get('workers', '?'), 'worker')}{clock}; Python "
             f"{run.get('python', '?')}, {versions}"
         )
         dates.setdefault(text, []).append(run["date"])

@@ -261,7 +261,11 @@ def answer_verify(body: bytes) -> Answer:
 
 
 def _answer(record: JsonObject, status: str) -> Answer:
-    return Answer(200, orjson.dumps(record, option=orjson.OPT_APPEND_NEWLINE), status)
+    try:
+        content = orjson.dumps(record, option=orjson.OPT_APPEND_NEWLINE)
+    except TypeError:  # a name with half a surrogate pair, which `json` writes as an escape
+        content = json.dumps(record).encode() + b"\n"
+    return Answer(200, content, status)
 
 
 MOTIONS = ("path", "trajectory")
